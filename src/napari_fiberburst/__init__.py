@@ -1,0 +1,49 @@
+"""One clean, sharper picture from a burst of frames through a fibre bundle.
+
+The public names load on first use, so that importing the package costs neither torch nor Qt.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from napari_fiberburst.burst import Burst as Burst
+    from napari_fiberburst.control import Control as Control
+    from napari_fiberburst.errors import FiberBurstError as FiberBurstError
+    from napari_fiberburst.io import read_burst as read_burst
+    from napari_fiberburst.reconstruction import Reconstruction as Reconstruction
+    from napari_fiberburst.settings import Settings as Settings
+    from napari_fiberburst.solver import Progress as Progress
+    from napari_fiberburst.solver import iterate as iterate
+    from napari_fiberburst.solver import load as load
+    from napari_fiberburst.solver import reconstruct as reconstruct
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Burst": "burst",
+    "Control": "control",
+    "FiberBurstError": "errors",
+    "Progress": "solver",
+    "Reconstruction": "reconstruction",
+    "Settings": "settings",
+    "iterate": "solver",
+    "load": "solver",
+    "read_burst": "io",
+    "reconstruct": "solver",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name from its module the first time it is asked for (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

@@ -1,0 +1,39 @@
+"""The command ``fiberburst``: reconstruct, simulate, demo, info."""
+
+import argparse
+import logging
+import sys
+from collections.abc import Sequence
+
+from napari_fiberburst import __version__
+from napari_fiberburst.cli import demo, info, reconstruct, simulate
+from napari_fiberburst.errors import FiberBurstError
+
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status: 0, 2 for input it cannot use, 130 when interrupted."""
+    logging.basicConfig(format="fiberburst: %(message)s", level=logging.WARNING)
+    options = _parser().parse_args(arguments)
+    try:
+        status: int = options.run(options)
+    except FiberBurstError as error:
+        print(f"fiberburst: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nfiberburst: interrupted; nothing was written", file=sys.stderr)
+        return INTERRUPTED
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="fiberburst",
+        description="Turn a burst of frames through a fibre bundle into one clean picture.",
+    )
+    parser.add_argument("--version", action="version", version=f"napari-fiberburst {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for command in (reconstruct, simulate, demo, info):
+        command.add_to(commands)
+    return parser

@@ -1,0 +1,63 @@
+"""Command line options made from the settings' own docs."""
+
+import argparse
+from typing import Any, NoReturn
+
+from napari_fiberburst.knobs import Knob, knobs_of
+from napari_fiberburst.settings import ENCODINGS, MOTIONS, PRESETS, Settings, choice_docs
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add an option for the preset, the motion, the encoding, and every knob there is."""
+    parser.add_argument("--preset", choices=PRESETS, default=next(iter(PRESETS)), help="where settings start from")
+    for part, known in (("motion", MOTIONS), ("encoding", ENCODINGS)):
+        texts = [f"{name}: {text}" for of, name, text in choice_docs() if of == part]
+        parser.add_argument(f"--{part}", choices=known, help=" ".join(texts).replace("%", "%%"))
+    owners: dict[str, list[str]] = {}
+    knobs: dict[str, Knob] = {}
+    for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()):
+        for name, knob in knobs_of(owner).items():
+            knobs.setdefault(name, knob)
+            owners.setdefault(name, []).append(getattr(owner, "name", ""))
+    for name, knob in knobs.items():
+        _add(parser, knob, " and ".join(filter(None, owners[name])))
+
+
+def settings_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what `napari_fiberburst.settings.choose` takes, from parsed options; unset ones are None."""
+    names = {"preset", "motion", "encoding"}
+    for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()):
+        names |= set(knobs_of(owner))
+    return {name: getattr(options, name) for name in sorted(names)}
+
+
+def parse_crop(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Read ``y0:y1,x0:x1`` as rows and columns."""
+    try:
+        rows, columns = (tuple(int(edge) for edge in part.split(":")) for part in text.split(","))
+        (y0, y1), (x0, x1) = rows, columns
+    except ValueError:
+        _refuse(f"expected y0:y1,x0:x1, such as 400:700,430:730; got {text!r}")
+    return (y0, y1), (x0, x1)
+
+
+def parse_shape(text: str) -> tuple[int, int]:
+    """Read ``HEIGHTxWIDTH``."""
+    try:
+        height, width = (int(side) for side in text.lower().split("x"))
+    except ValueError:
+        _refuse(f"expected HEIGHTxWIDTH, such as 256x256; got {text!r}")
+    return height, width
+
+
+def _add(parser: argparse.ArgumentParser, knob: Knob, owner: str) -> None:
+    default = "" if knob.default is None else f"default {knob.default}"
+    remarks = "; ".join(filter(None, [owner and f"{owner} only", default]))
+    text = f"{knob.doc} ({remarks})" if remarks else knob.doc
+    parser.add_argument(
+        f"--{knob.name.replace('_', '-')}", type=knob.kind, metavar=knob.kind.__name__.upper(), help=text
+    )
+
+
+def _refuse(message: str) -> NoReturn:
+    raise argparse.ArgumentTypeError(message)

@@ -1,0 +1,56 @@
+"""``fiberburst simulate``."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napari_fiberburst.cli.arguments import parse_shape
+from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.simulation import MOTIONS, SCENES, simulate
+from napari_fiberburst.simulation.simulate import PHYSICS
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "simulate",
+        help="make a burst with known truth",
+        description="Simulate a burst: frames as recorded, and the truth behind them, in one npz file.",
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a file ending in .npz")
+    parser.add_argument("--scene", choices=SCENES, default="histology", help="what there is to see")
+    parser.add_argument("--shape", type=parse_shape, default=(256, 256), metavar="HxW", help="default 256x256")
+    parser.add_argument("--frames", type=int, default=20, help="default 20")
+    parser.add_argument("--channels", type=int, help="default, the scene's own")
+    parser.add_argument("--motion", choices=MOTIONS, default="brownian", help="how the object moves")
+    parser.add_argument("--physics", choices=PHYSICS, default="mask", help="what a core does to the light")
+    parser.add_argument("--pitch", type=float, default=7.0, help="distance of cores in pixels, default 7")
+    parser.add_argument("--dead-cores", type=float, default=0.0, help="part of the cores that are dark, default 0")
+    parser.add_argument("--outline", choices=("frame", "circle"), default="frame", help="what the cores fill")
+    parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same burst")
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Simulate and write."""
+    if options.output.suffix != ".npz":
+        raise OutputError(f"a simulated burst is written with its truth to a .npz file; got {options.output}")
+    with write_whole(options.output) as stream:
+        simulated = simulate(
+            options.scene,
+            shape=options.shape,
+            frames=options.frames,
+            channels=options.channels,
+            motion=options.motion,
+            physics=options.physics,
+            seed=options.seed,
+            pitch=options.pitch,
+            dead_cores=options.dead_cores,
+            outline=options.outline,
+        )
+        np.savez_compressed(stream, allow_pickle=False, **simulated.arrays())
+    print(f"wrote {options.output}: {simulated.burst}")
+    return 0

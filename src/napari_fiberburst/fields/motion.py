@@ -1,0 +1,142 @@
+"""Motion fields g: where in the scene each pixel of each frame looks. All start at the identity."""
+
+from abc import ABC, abstractmethod
+from typing import assert_never
+
+import torch
+from torch import Generator, Tensor, nn
+
+from napari_fiberburst import settings
+from napari_fiberburst.fields.layers import make_mlp, make_siren, zero_output
+from napari_fiberburst.geometry.homography import apply
+
+# A flow field is inverted to 1e-4 of half a frame: about 0.03 px of 600.
+_INVERSION_STEPS = 30
+_INVERSION_TOLERANCE = 1e-4
+
+
+class MotionField(nn.Module, ABC):
+    """Map points of a frame into the scene, both in unit coordinates of frame 0.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the burst; its times are spread over [-1, 1].
+
+    Attributes
+    ----------
+    scene_dimensions : int
+        Coordinates that the scene is a function of: 2 for (x, y), 3 for (x, y, t).
+    """
+
+    scene_dimensions = 2
+    times: Tensor
+
+    def __init__(self, frames: int) -> None:
+        super().__init__()
+        self.register_buffer("times", torch.linspace(-1, 1, frames))
+
+    @abstractmethod
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return scene points (N, scene_dimensions) for `points` (N, 2) of the frames numbered `frames` (N,)."""
+
+    def scene_from_frame(self) -> Tensor:
+        """Return homographies (T, 3, 3) in unit coordinates; the identity for motions that have none."""
+        return torch.eye(3, device=self.times.device).expand(len(self.times), 3, 3)
+
+    def roughness(self, points: Tensor, frames: Tensor) -> Tensor | None:
+        """Return what a prior on the motion adds to the loss, or None where there is no prior."""
+        return None
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return where frame 0 shows what each point (N, 2) of its frame shows; NaN where that is nowhere.
+
+        Frame 0's own map is inverted by fixed-point iteration, which converges where that map bends by less
+        than its argument moves.
+        """
+        seen = self(points, frames)
+        first = torch.zeros_like(frames)
+        found = seen
+        for _ in range(_INVERSION_STEPS):
+            missed = seen - self(found, first)
+            found = found + missed
+        return torch.where(missed.abs().amax(dim=1, keepdim=True) < _INVERSION_TOLERANCE, found, torch.nan)
+
+
+class StillField(MotionField):
+    """No motion, T(x, y, t) = (x, y, t): the scene memorises space and time."""
+
+    scene_dimensions = 3
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 3): the points, and the time of each one's frame."""
+        return torch.cat([points, self.times[frames, None]], dim=1)
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return the points themselves."""
+        return points
+
+
+class HomographyField(MotionField):
+    """M_t = g(t), 3x3 with bottom right element 1, from a ReLU network of time."""
+
+    def __init__(self, frames: int, choice: settings.Homography, generator: Generator) -> None:
+        super().__init__(frames)
+        self.network = make_mlp([1, *[choice.motion_width] * choice.motion_layers, 8], generator)
+        zero_output(self.network)
+
+    def scene_from_frame(self) -> Tensor:
+        """Return M_t for every frame, (T, 3, 3)."""
+        change = nn.functional.pad(self.network(self.times[:, None]), (0, 1))
+        return torch.eye(3, device=change.device) + change.view(-1, 3, 3)
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): M_t applied to each point. The network runs once a frame, not once a point."""
+        return apply(self.scene_from_frame()[frames], points)
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return inv(M_0) M_t applied to each point."""
+        scene_from_frame = self.scene_from_frame()
+        frame0_from_frame = torch.linalg.solve(scene_from_frame[0], scene_from_frame)
+        return apply(frame0_from_frame[frames], points)
+
+
+class FlowField(MotionField):
+    """(x + dx, y + dy) with (dx, dy) = g(x, y, t), a sine network."""
+
+    def __init__(self, frames: int, choice: settings.Flow | settings.FlowTV, generator: Generator) -> None:
+        super().__init__(frames)
+        widths = [3, *[choice.motion_width] * choice.motion_layers, 2]
+        self.network = make_siren(widths, choice.flow_omega_0, generator)
+        zero_output(self.network)
+        self.tv_weight = choice.tv_weight if isinstance(choice, settings.FlowTV) else 0.0
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): each point plus its displacement."""
+        displacement: Tensor = self.network(self._places(points, frames))
+        return points + displacement
+
+    def roughness(self, points: Tensor, frames: Tensor) -> Tensor | None:
+        """Return the weighted mean absolute Jacobian of g over x, y and t."""
+        if not self.tv_weight:
+            return None
+        places = self._places(points, frames).requires_grad_()
+        displacement = self.network(places)
+        rows = [torch.autograd.grad(displacement[:, axis].sum(), places, create_graph=True)[0] for axis in range(2)]
+        return self.tv_weight * torch.stack(rows).abs().mean()
+
+    def _places(self, points: Tensor, frames: Tensor) -> Tensor:
+        return torch.cat([points, self.times[frames, None]], dim=1)
+
+
+def make_motion(choice: settings.Motion, frames: int, generator: Generator) -> MotionField:
+    """Build the motion field that the settings ask for; `generator` gives all random numbers, on the CPU."""
+    match choice:
+        case settings.NoMotion():
+            return StillField(frames)
+        case settings.Homography():
+            return HomographyField(frames, choice, generator)
+        case settings.Flow() | settings.FlowTV():
+            return FlowField(frames, choice, generator)
+        case _:
+            assert_never(choice)

@@ -1,0 +1,66 @@
+"""Frames that lie in a file each."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.recording import Recording
+
+PICTURE_ENDINGS = (".png", ".tif", ".tiff")
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """Return a sort key that counts: frame2 stands before frame10."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(int(part), "") if part.isdigit() else (-1, part.lower()) for part in parts]
+
+
+def read_pictures(paths: list[Path], source: str) -> Recording:
+    """Read one frame from each file, in natural order of their names.
+
+    Raises
+    ------
+    BurstError
+        No files, a file that is no picture, or pictures of different sizes or types.
+    """
+    if not paths:
+        raise BurstError(f"{source} holds no frames; expected files ending in {', '.join(PICTURE_ENDINGS)}")
+    frames: list[NDArray[Any]] = []
+    for path in sorted(paths, key=natural_key):
+        try:
+            frame = np.squeeze(_read_picture(path))
+        except BurstError:
+            raise
+        except Exception as error:  # codecs fail on damaged files in many ways
+            raise BurstError(f"{path} cannot be read as a picture ({error}); replace it or leave it out") from error
+        if frame.ndim not in (2, 3):
+            raise BurstError(f"{path} must hold one frame, (height, width) or with channels; got shape {frame.shape}")
+        if frames and (frame.shape, frame.dtype) != (frames[0].shape, frames[0].dtype):
+            raise BurstError(
+                f"all frames need one size and type; {path} has {frame.shape} {frame.dtype} where those before have "
+                f"{frames[0].shape} {frames[0].dtype}; crop or convert it, or leave it out"
+            )
+        frames.append(frame)
+    return Recording(pixels=np.stack(frames), axes="TYX" if frames[0].ndim == 2 else "TYXC")
+
+
+def _read_picture(path: Path) -> NDArray[Any]:
+    if path.suffix.lower() != ".png":
+        return np.asarray(tifffile.imread(path))
+    with Image.open(path) as picture:
+        depth = path.read_bytes()[_PNG_BIT_DEPTH]
+        if depth == 16 and not picture.mode.startswith("I"):
+            raise BurstError(f"{path} has 16 bits per colour, of which only 8 could be read; save the frames as TIFF")
+        # A palette stands for colours, and an alpha channel is no light.
+        mode = {"P": "RGB", "RGBA": "RGB", "LA": "L"}.get(picture.mode, picture.mode)
+        return np.asarray(picture.convert(mode))
+
+
+# Where the bit depth stands in the header of every PNG file.
+_PNG_BIT_DEPTH = 24

@@ -1,0 +1,96 @@
+"""Open a burst from whatever it lies in."""
+
+import glob
+from pathlib import Path
+
+import numpy as np
+
+from napari_fiberburst.burst import Burst
+from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.folder import PICTURE_ENDINGS, read_pictures
+from napari_fiberburst.io.recording import Recording
+from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
+from napari_fiberburst.io.zarr import is_zarr, read_zarr
+
+_FORMATS = (
+    "a TIFF stack (.tif, .tiff, .ome.tif), a folder of PNG or TIFF frames, a pattern such as 'frames/*.png', "
+    "a .npz file, or OME-Zarr (.zarr)"
+)
+
+
+def read_burst(
+    path: str | Path,
+    *,
+    axes: str | None = None,
+    black_level: float | None = None,
+    white_level: float | None = None,
+) -> Burst:
+    """Read a burst from a file, a folder or a pattern.
+
+    Parameters
+    ----------
+    path : str or Path
+        A multi-page TIFF or OME-TIFF; a folder of PNG or TIFF frames, or a pattern such as ``frames/*.png``, taken in
+        natural order (2 before 10); a ``.npz`` file with an array "frames", or with only one array; an OME-Zarr
+        image (needs the extra ``zarr``).
+    axes : str, optional
+        Order of the axes, where the file does not say it or is wrong.
+    black_level, white_level : float, optional
+        As in `Burst`.
+
+    Returns
+    -------
+    Burst
+        With channel names, pixel size, unit and frame times where the file has them.
+
+    Raises
+    ------
+    BurstError
+        There is nothing at the path, it cannot be read, or its frames are no burst.
+    """
+    recording = _open(Path(path))
+    try:
+        return Burst(
+            recording.pixels,
+            axes=axes or recording.axes,
+            black_level=black_level,
+            white_level=white_level,
+            channel_names=recording.channel_names,
+            pixel_size=recording.pixel_size,
+            unit=recording.unit,
+            times=recording.times,
+        )
+    except BurstError as error:
+        raise BurstError(f"{path}: {error}") from error
+
+
+def _open(path: Path) -> Recording:
+    if glob.has_magic(str(path)) and not path.exists():
+        return read_pictures([Path(name) for name in glob.glob(str(path))], str(path))
+    if not path.exists():
+        raise BurstError(f"there is no {path}; expected {_FORMATS}")
+    if path.is_dir():
+        if is_zarr(path):
+            return read_zarr(path)
+        found = [item for item in path.iterdir() if item.suffix.lower() in PICTURE_ENDINGS]
+        return read_pictures(found, f"the folder {path}")
+    if path.suffix.lower() in TIFF_ENDINGS:
+        return read_tiff(path)
+    if path.suffix.lower() == ".npz":
+        return _read_npz(path)
+    raise BurstError(f"{path} is of no kind that can be read; expected {_FORMATS}")
+
+
+def _read_npz(path: Path) -> Recording:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            names = list(arrays)
+            if "frames" not in names and len(names) != 1:
+                raise BurstError(f"{path} needs an array named 'frames'; it has {', '.join(names) or 'none'}")
+            name = "frames" if "frames" in names else names[0]
+            axes = str(arrays["axes"]) if "axes" in names else None
+            return Recording(pixels=arrays[name], axes=axes)
+    except BurstError:
+        raise
+    except Exception as error:  # a damaged archive fails in zipfile, zlib or numpy, each in its own way
+        raise BurstError(f"{path} cannot be read as npz ({error}); save it again with numpy.savez") from error

@@ -1,0 +1,140 @@
+"""Knobs: dataclass fields that carry their own range and their own words.
+
+A setting is described once, where it is declared. The reader of the code, ``--help`` and a form's tooltip all
+show that text, and every settings object refuses values out of range by the same rule.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import Field, dataclass, field, fields
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from napari_fiberburst.errors import SettingsError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knob:
+    """One setting as a form or a command line needs it.
+
+    Attributes
+    ----------
+    name : str
+        The field's name.
+    kind : type
+        int, float or str.
+    default : object
+        The value it has where nobody turns it.
+    doc : str
+        What it does and which way it turns.
+    optional : bool
+        Whether None is allowed (the text says what None does).
+    least, above, most : float or None
+        Inclusive lower, exclusive lower and inclusive upper bound.
+    choices : tuple of str
+        The allowed values, where they are a closed set.
+    """
+
+    name: str
+    kind: type
+    default: object
+    doc: str
+    optional: bool = False
+    least: float | None = None
+    above: float | None = None
+    most: float | None = None
+    choices: tuple[str, ...] = ()
+
+    @property
+    def expected(self) -> str:
+        """The allowed values in words, as in "an integer of at least 1"."""
+        if self.choices:
+            words = "one of " + ", ".join(self.choices)
+        else:
+            words = {int: "an integer", float: "a number", str: "a text"}[self.kind]
+            bounds = [("of at least", self.least), ("above", self.above), ("of at most", self.most)]
+            words = " ".join([words, *(f"{text} {bound:g}" for text, bound in bounds if bound is not None)])
+        return f"{words}, or None" if self.optional else words
+
+    def allows(self, value: object) -> bool:
+        """Whether ``value`` has the right type and lies in range."""
+        if value is None:
+            return self.optional
+        if self.kind is str:
+            return isinstance(value, str) and (not self.choices or value in self.choices)
+        wanted = Integral if self.kind is int else Real
+        if isinstance(value, bool) or not isinstance(value, wanted):
+            return False
+        number = float(value)
+        return (
+            math.isfinite(number)
+            and (self.least is None or number >= self.least)
+            and (self.above is None or number > self.above)
+            and (self.most is None or number <= self.most)
+        )
+
+
+def knob(
+    default: Any,
+    doc: str,
+    *,
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+) -> Any:
+    """Declare a dataclass field with its text and range.
+
+    Parameters
+    ----------
+    default : object
+        Value where nobody turns it.
+    doc : str
+        One sentence: what it is, and what more of it does.
+    least, above, most : float, optional
+        Inclusive lower, exclusive lower and inclusive upper bound.
+
+    Returns
+    -------
+    dataclasses.Field
+        Typed as Any, so that it can stand as the default of a field of any type.
+    """
+    return field(default=default, metadata={"doc": doc, "least": least, "above": above, "most": most})
+
+
+def knobs_of(settings_type: type) -> dict[str, Knob]:
+    """Return the knobs of a settings class by name, in the order they are declared."""
+    hints = get_type_hints(settings_type)
+    return {item.name: _read(item, hints[item.name]) for item in _declared(settings_type)}
+
+
+def check(settings: object) -> None:
+    """Refuse a settings object with a value of the wrong type or out of range.
+
+    Raises
+    ------
+    SettingsError
+        Names the setting, what it may be and what came.
+    """
+    for name, knob in knobs_of(type(settings)).items():
+        value = getattr(settings, name)
+        if not knob.allows(value):
+            raise SettingsError(f"{name} must be {knob.expected}; got {value!r}")
+
+
+def _declared(settings_type: type) -> Iterator[Field[Any]]:
+    return (item for item in fields(settings_type) if "doc" in item.metadata)
+
+
+def _read(item: Field[Any], hint: Any) -> Knob:
+    options = get_args(hint) if isinstance(hint, UnionType) else (hint,)
+    (kind,) = [option for option in options if option is not NoneType]
+    choices = get_args(kind) if get_origin(kind) is Literal else ()
+    return Knob(
+        name=item.name,
+        kind=str if choices else kind,
+        default=item.default,
+        optional=NoneType in options,
+        choices=choices,
+        **item.metadata,
+    )

@@ -1,0 +1,22 @@
+"""Bursts with ground truth: a scene, a motion, a bundle, a camera. numpy and scipy, and a warp of its own."""
+
+from napari_fiberburst.simulation.bundle import Bundle, make_bundle
+from napari_fiberburst.simulation.camera import Camera
+from napari_fiberburst.simulation.motion import MOTIONS, brownian_motion, handheld_motion, raster_motion
+from napari_fiberburst.simulation.scenes import SCENES, Scene, make_scene
+from napari_fiberburst.simulation.simulate import SimulatedBurst, simulate
+
+__all__ = [
+    "MOTIONS",
+    "SCENES",
+    "Bundle",
+    "Camera",
+    "Scene",
+    "SimulatedBurst",
+    "brownian_motion",
+    "handheld_motion",
+    "make_bundle",
+    "make_scene",
+    "raster_motion",
+    "simulate",
+]

@@ -1,0 +1,173 @@
+"""The command line, as a user types it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import tifffile
+
+from napari_fiberburst.cli import demo, main
+
+SMALL = ["--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
+
+
+@pytest.fixture
+def burst_file(tmp_path):
+    path = tmp_path / "burst.npz"
+    assert main(["simulate", "-o", str(path), "--shape", "33x41", "--frames", "3", "--pitch", "3"]) == 0
+    return path
+
+
+def test_simulate_writes_the_burst_and_its_truth(burst_file):
+    with np.load(burst_file) as arrays:
+        assert arrays["frames"].shape == arrays["truth"].shape == (3, 33, 41, 3)
+        assert arrays["homographies"].shape == (3, 3, 3)
+        assert arrays["transmission"].shape == (33, 41)
+
+
+def test_info_tells_what_a_burst_holds(burst_file, capsys):
+    assert main(["info", str(burst_file)]) == 0
+    told = capsys.readouterr().out
+    assert "33 x 41" in told
+    assert "uint8" in told
+
+
+def test_reconstruct_writes_a_picture(burst_file, tmp_path, capsys):
+    out = tmp_path / "picture.ome.tif"
+    assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "5", *SMALL]) == 0
+    assert tifffile.imread(out).shape == (3, 33, 41)
+    assert "finished after 5 steps" in capsys.readouterr().out
+
+
+def test_reconstruct_takes_a_crop_and_settings_by_name(burst_file, tmp_path):
+    out = tmp_path / "picture.ome.tif"
+    command = ["reconstruct", str(burst_file), "-o", str(out), "--crop", "5:25,10:40", "--encoding", "nerf"]
+    assert main([*command, "--highest-octave", "3", "--iterations", "2", "--seed", "7", *SMALL]) == 0
+    told = json.loads((tmp_path / "picture.json").read_text())
+    assert tifffile.imread(out).shape == (3, 20, 30)
+    assert told["burst"]["origin"] == [5, 10]
+    assert told["settings"]["encoding"] == {"name": "nerf", "highest_octave": 3}
+    assert told["seed"] == 7
+
+
+def test_reconstruct_can_write_the_networks(burst_file, tmp_path):
+    out = tmp_path / "scene.npz"
+    assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "2", *SMALL]) == 0
+    assert out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (["--sigma", "-1"], "sigma must be a number above 0"),
+        (["--encoding", "siren", "--sigma", "3"], "belongs to encoding 'fourier'"),
+        (["--crop", "0:99,0:20"], "within 0:33"),
+        (["--device", "cuda:77"], "is not on this machine"),
+        (["--iterations", "0"], "at least 1"),
+        (["-o", "nowhere/picture.tif"], "does not exist"),
+        (["-o", "picture.bmp"], "ending in"),
+    ],
+)
+def test_bad_input_says_why_and_leaves_no_file(burst_file, tmp_path, capsys, change, said):
+    out = [] if "-o" in change else ["-o", str(tmp_path / "picture.tif")]
+    assert main(["reconstruct", str(burst_file), *out, *change]) == 2
+    assert said in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == [burst_file]
+
+
+def test_a_missing_burst_is_said(tmp_path, capsys):
+    assert main(["info", str(tmp_path / "none.tif")]) == 2
+    assert "there is no" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["reconstruct", "burst.npz", "-o", "a.tif", "--crop", "5-9"],
+        ["reconstruct", "burst.npz", "-o", "a.tif", "--motion", "zoom"],
+        ["simulate", "-o", "a.npz", "--shape", "9"],
+        ["reconstruct"],
+        [],
+    ],
+)
+def test_what_cannot_be_parsed_shows_the_usage(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 2
+    assert "usage: fiberburst" in capsys.readouterr().err
+
+
+def test_help_comes_from_the_settings(capsys):
+    with pytest.raises(SystemExit):
+        main(["reconstruct", "--help"])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Frequency spread, cycles per half frame; more resolves finer detail" in told
+    assert "(fourier only; default 5.0)" in told
+    assert "homography: One 3x3 homography per frame" in told
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
+def test_ctrl_c_writes_what_there_is(burst_file, tmp_path):
+    out = tmp_path / "picture.ome.tif"
+    command = ["reconstruct", str(burst_file), "-o", str(out), "--iterations", "1000000", *SMALL]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"import sys; from napari_fiberburst.cli import main; sys.exit(main({command}))"],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=environment,
+    )
+    seen = b""
+    while b"loss" not in seen:  # it is running
+        seen += process.stderr.read1()
+    process.send_signal(signal.SIGINT)
+    told, complaints = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert b"stopped after" in told
+    assert b"writing what there is" in complaints
+    assert tifffile.imread(out).shape == (3, 33, 41)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
+def test_a_second_ctrl_c_ends_at_once(tmp_path):
+    code = (
+        "import time; from napari_fiberburst import Control\n"
+        "from napari_fiberburst.cli.reconstruct import stop_on_interrupt\n"
+        "with stop_on_interrupt(Control()):\n"
+        "    print('running', flush=True)\n"
+        "    try: time.sleep(60)\n"
+        "    except KeyboardInterrupt: print('ended', flush=True)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"running\n"
+        process.send_signal(signal.SIGINT)
+        assert b"again ends at once" in process.stderr.readline() + process.stderr.readline()
+        start = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == b"ended\n"
+    assert time.monotonic() - start < 30
+
+
+def test_the_demo_prints_its_figures_and_draws(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "_BURST", {**demo._BURST, "shape": (49, 57), "frames": 3})
+    out = tmp_path / "demo.png"
+    assert main(["demo", "-o", str(out), "--iterations", "3", "--device", "cpu"]) == 0
+    told = capsys.readouterr().out
+    for line in ("captured frame", "Gaussian filter", "reconstruction", "motion off by"):
+        assert line in told
+    from imageio.v3 import imread
+
+    picture = imread(out)
+    assert picture.shape[1] == 4 * 57 + 3 * 8
+    assert picture.std() > 20
+
+
+def test_the_demo_refuses_a_place_it_cannot_write(tmp_path, capsys):
+    assert main(["demo", "-o", str(tmp_path / "none" / "demo.png")]) == 2
+    assert main(["demo", "-o", str(tmp_path / "demo.gif")]) == 2
+    assert "does not exist" in capsys.readouterr().err

@@ -1,0 +1,274 @@
+"""The run: what it reports, how it ends, what it returns."""
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from napari_fiberburst import Burst, Control, iterate, reconstruct
+from napari_fiberburst.errors import BurstError, DeviceError, FiberBurstError, SettingsError
+from napari_fiberburst.settings import choose
+from napari_fiberburst.solver.problem import Problem
+from napari_fiberburst.solver.samples import Samples
+
+
+def same(first, second):
+    np.testing.assert_array_equal(first.image, second.image)
+    np.testing.assert_array_equal(first.homographies, second.homographies)
+    np.testing.assert_array_equal(first.losses, second.losses)
+
+
+def test_a_run_returns_what_it_promises(fit, tiny_burst):
+    result = fit(tiny_burst)
+    assert result.image.shape == (31, 37, 3)
+    assert result.image.dtype == np.float32
+    assert result.homographies.shape == (5, 3, 3)
+    assert result.homographies.dtype == np.float64
+    np.testing.assert_array_equal(result.homographies[0], np.eye(3))
+    assert result.losses.shape == (10,)
+    assert np.isfinite(result.losses).all()
+    assert result.ending == "finished"
+    assert result.device == "cpu"
+    assert result.seconds > 0
+    assert result.settings.iterations == 10
+
+
+@pytest.mark.parametrize("motion", ["none", "homography", "flow", "flow_tv"])
+@pytest.mark.parametrize("encoding", ["none", "nerf", "fourier", "hash", "siren"])
+def test_every_motion_runs_with_every_encoding(fit, tiny_burst, motion, encoding):
+    result = fit(tiny_burst, motion=motion, encoding=encoding, iterations=40, learning_rate=3e-3)
+    assert np.isfinite(result.image).all()
+    assert result.losses[-5:].mean() < result.losses[:5].mean()
+    if motion != "homography":
+        np.testing.assert_array_equal(result.homographies, np.tile(np.eye(3), (5, 1, 1)))
+
+
+@pytest.mark.parametrize("channels", [1, 3, 7])
+def test_any_number_of_channels(fit, rng, channels):
+    frames = rng.integers(0, 4096, (3, 17, 23, channels), dtype=np.uint16)
+    result = fit(frames)
+    assert result.image.shape == (17, 23, channels)
+    assert result.frame(1).shape == (17, 23, channels)
+
+
+def test_a_grey_burst_gives_a_grey_picture(fit, rng):
+    assert fit(rng.random((3, 17, 23))).image.shape == (17, 23)
+
+
+def test_the_picture_is_in_the_units_of_the_burst(fit, rng):
+    frames = rng.normal(3000, 20, (3, 17, 23)).astype(np.float32)
+    assert fit(frames, iterations=300, learning_rate=1e-2).image.mean() == pytest.approx(3000, rel=0.01)
+
+
+def test_the_same_call_twice_gives_the_same_bits(fit, tiny_burst):
+    for choices in ({}, {"motion": "flow_tv"}, {"encoding": "hash"}):
+        same(fit(tiny_burst, **choices), fit(tiny_burst, **choices))
+    assert not np.array_equal(fit(tiny_burst, seed=1).image, fit(tiny_burst, seed=2).image)
+
+
+def test_reporting_does_not_change_the_result(fit, tiny_burst):
+    same(fit(tiny_burst), fit(tiny_burst, on_progress=lambda report: None, preview_every=1e-9))
+
+
+def test_an_array_a_burst_and_a_path_are_the_same(fit, tiny_burst, tiny_simulation, tmp_path):
+    arrays = tiny_simulation.arrays()
+    np.savez(tmp_path / "burst.npz", **arrays)
+    expected = fit(tiny_burst)
+    same(fit(arrays["frames"]), expected)
+    same(fit(tmp_path / "burst.npz"), expected)
+    same(fit(str(tmp_path / "burst.npz")), expected)
+
+
+def test_it_runs_where_gradients_are_switched_off(fit, tiny_burst):
+    with torch.no_grad():
+        off = fit(tiny_burst)
+    same(off, fit(tiny_burst))
+
+
+def test_reports_begin_with_the_first_step_and_end_with_the_last(fit, tiny_burst):
+    reports = []
+    result = fit(tiny_burst, on_progress=reports.append, preview_every=1e-9)
+    assert [reports[0].step, reports[-1].step] == [1, 10]
+    assert reports[-1].loss == result.losses[-1]
+    np.testing.assert_array_equal(reports[-1].preview, result.image)
+    np.testing.assert_array_equal(reports[-1].homographies, result.homographies)
+    assert reports[0].remaining is None
+    assert reports[-1].remaining == 0
+    assert all(isinstance(report.preview, np.ndarray) for report in reports)
+    with pytest.raises(AttributeError):
+        reports[0].loss = 0
+
+
+def test_no_previews_are_drawn_unless_asked_for(fit, tiny_burst):
+    reports = []
+    fit(tiny_burst, on_progress=reports.append)
+    assert all(report.preview is None for report in reports)
+
+
+def test_the_loss_is_the_mean_squared_error_of_its_samples(tiny_burst):
+    settings = choose(iterations=1, scene_width=8, motion_width=8, batch=100, device="cpu")
+    problem = Problem(tiny_burst, settings, torch.device("cpu"))
+    batch = Samples(tiny_burst, torch.device("cpu"), seed=0).draw(100)
+    with torch.no_grad():
+        expected = (problem.field(batch.points, batch.frames) - batch.intensities).square().mean()
+    assert problem.step() == pytest.approx(expected.item())
+
+
+def test_a_step_takes_an_eighth_of_a_frame_unless_told(tiny_burst):
+    published = Problem(tiny_burst, choose(), torch.device("cpu"))
+    assert published.batch == -(-31 * 37 // 8)
+    assert Problem(tiny_burst, choose(batch=7), torch.device("cpu")).batch == 7
+
+
+def test_stopping_gives_a_usable_result(fit, tiny_burst):
+    asked = iter([False, False, False, True])
+    result = fit(tiny_burst, should_stop=lambda: next(asked))
+    assert result.ending == "stopped"
+    assert len(result.losses) == 3
+    same(result, fit(tiny_burst, iterations=3))
+
+
+def test_stopping_before_the_first_step_gives_the_start(fit, tiny_burst):
+    control = Control()
+    control.stop()
+    result = fit(tiny_burst, control=control)
+    assert len(result.losses) == 0
+    assert np.isfinite(result.image).all()
+    np.testing.assert_array_equal(result.homographies, np.tile(np.eye(3), (5, 1, 1)))
+
+
+def test_a_time_budget_ends_the_run(fit, tiny_burst):
+    result = fit(tiny_burst, iterations=10**6, time_budget=0.3)
+    assert result.ending == "time budget"
+    assert 0 < len(result.losses) < 10**6
+
+
+def test_a_pause_does_not_count_as_time(fit, tiny_burst):
+    control = Control()
+    control.pause()
+    threading.Timer(0.5, control.resume).start()
+    result = fit(tiny_burst, control=control, time_budget=0.4)
+    assert len(result.losses) > 0
+    assert result.seconds < 0.5 + 0.4
+
+
+def test_sigma_and_learning_rate_change_while_it_runs(fit, tiny_burst):
+    control = Control()
+
+    def turn(report):
+        control.sigma, control.learning_rate = 1.5, 1e-2
+
+    result = fit(tiny_burst, control=control, on_progress=turn)
+    assert result.settings.encoding.sigma == 1.5
+    assert result.settings.learning_rate == 1e-2
+    assert result.renderer.field.scene.encoding.sigma.item() == 1.5
+    assert not np.array_equal(result.image, fit(tiny_burst).image)
+
+
+def test_a_live_sigma_that_has_no_effect_is_said(fit, tiny_burst, caplog):
+    control = Control()
+    control.sigma = 2.0
+    with caplog.at_level(logging.WARNING):
+        fit(tiny_burst, control=control, encoding="nerf")
+    assert caplog.messages == ["sigma 2 has no effect: encoding nerf has no frequency spread"]
+
+
+def test_a_loss_that_is_no_number_ends_the_run_with_the_last_good_state(fit, tiny_burst, caplog):
+    with caplog.at_level(logging.WARNING):
+        result = fit(tiny_burst, learning_rate=1e30, iterations=50)
+    assert result.ending == "diverged"
+    assert np.isfinite(result.image).all()
+    assert np.isfinite(result.losses).all()
+    assert len(result.losses) < 50
+    assert "a learning rate lower than 1e+30 may help" in caplog.text
+
+
+def test_a_run_continued_is_the_run_undivided(fit, tiny_burst):
+    whole = fit(tiny_burst, iterations=30)
+    half = fit(tiny_burst, iterations=12)
+    image = half.image.copy()
+    continued = fit(tiny_burst, iterations=18, initial=half)
+    same(continued, whole)
+    assert continued.seconds > half.seconds
+    np.testing.assert_array_equal(half.render(), image)  # the first half is as it was
+
+
+def test_a_run_continues_with_its_own_settings(tiny_burst):
+    first = reconstruct(tiny_burst, encoding="siren", omega_0=7.0, iterations=2, batch=50, device="cpu")
+    assert reconstruct(tiny_burst, initial=first, iterations=1).settings.encoding == first.settings.encoding
+
+
+def test_continuing_another_fit_is_refused(fit, tiny_burst):
+    first = fit(tiny_burst)
+    with pytest.raises(SettingsError, match="continue with networks of the same kind"):
+        reconstruct(tiny_burst, initial=first, encoding="nerf")
+    with pytest.raises(SettingsError, match="must be a reconstruction of this burst"):
+        reconstruct(tiny_burst.crop((0, 20), (0, 20)), initial=first)
+
+
+def test_the_burst_is_left_as_it_was(fit, rng):
+    burst = Burst(rng.random((3, 17, 23)))
+    before = burst.frames.copy()
+    fit(burst)
+    np.testing.assert_array_equal(burst.frames, before)
+
+
+@pytest.mark.parametrize(
+    ("choices", "error"),
+    [
+        ({"device": "cuda:99"}, DeviceError),
+        ({"device": "abacus"}, DeviceError),
+        ({"preset": "none such"}, SettingsError),
+        ({"speed": 9}, SettingsError),
+        ({"iterations": 0}, SettingsError),
+    ],
+)
+def test_bad_calls_are_refused(tiny_burst, choices, error):
+    with pytest.raises(error) as raised:
+        reconstruct(tiny_burst, **choices)
+    assert isinstance(raised.value, FiberBurstError)
+
+
+def test_settings_are_checked_before_the_burst_is_read():
+    with pytest.raises(SettingsError):
+        reconstruct("no such file.tif", sigma=-1)
+    with pytest.raises(BurstError, match="there is no"):
+        reconstruct("no such file.tif")
+
+
+def test_iterate_is_a_generator_that_returns_the_reconstruction(tiny_burst):
+    run = iterate(tiny_burst, choose(iterations=2, batch=50, device="cpu"))
+    steps = []
+    while True:
+        try:
+            steps.append(next(run).step)
+        except StopIteration as end:
+            result = end.value
+            break
+    assert steps == [1, 2]
+    assert len(result.losses) == 2
+
+
+def test_samples_are_every_pixel_once_then_shuffled_anew(tiny_burst):
+    samples = Samples(tiny_burst, torch.device("cpu"), seed=0)
+    total = 5 * 31 * 37
+    epochs = [samples.draw(total), samples.draw(total)]
+    for batch in epochs:
+        x = np.rint((batch.points[:, 0].numpy() + 1) * 37 / 2 - 0.5).astype(int)
+        y = np.rint((batch.points[:, 1].numpy() + 1) * 31 / 2 - 0.5).astype(int)
+        t = batch.frames.numpy()
+        assert len(set(zip(t, y, x, strict=True))) == total
+        np.testing.assert_allclose(batch.intensities, 2 * tiny_burst.frames[t, y, x] - 1, atol=1e-6)
+    assert not torch.equal(epochs[0].points, epochs[1].points)
+
+
+def test_samples_go_on_across_the_end_of_an_epoch(tiny_burst):
+    device, total = torch.device("cpu"), 5 * 31 * 37
+    across = Samples(tiny_burst, device, seed=0)
+    across.draw(total - 3)
+    parts = across.draw(10)
+    again = Samples(tiny_burst, device, seed=0, drawn=total - 3)
+    assert torch.equal(again.draw(3).points, parts.points[:3])
+    assert torch.equal(again.draw(7).points, parts.points[3:])

@@ -1,0 +1,20 @@
+"""Every example runs, on a burst small enough for a test."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
+
+
+def test_there_are_examples():
+    assert EXAMPLES
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_example_runs(path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FIBERBURST_EXAMPLE_SCALE", "tiny")
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out
