@@ -29,7 +29,7 @@ def bare(field: JointField, problem: Problem) -> Callable[[], None]:
     def step() -> None:
         loss = (field(batch.points, batch.frames) - batch.intensities).square().mean()
         optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         optimizer.step()
 
     return step
