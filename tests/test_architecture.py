@@ -13,7 +13,7 @@ ALLOWED = {
     "errors": set(),
     "knobs": {"errors"},
     "settings": {"errors", "knobs"},
-    "control": {"errors"},
+    "control": {"errors", "knobs", "settings"},
     "burst": {"errors"},
     "io": BASE,
     "simulation": BASE,

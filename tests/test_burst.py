@@ -32,7 +32,13 @@ def test_any_number_of_channels(rng, channels):
 
 @pytest.mark.parametrize(
     ("dtype", "high", "white"),
-    [(np.uint8, 256, 255), (np.uint16, 900, 1023), (np.uint16, 4000, 4095), (np.uint16, 60000, 65535)],
+    [
+        (np.uint8, 256, 255),
+        (np.uint16, 900, 1023),
+        (np.uint16, 4000, 4095),
+        (np.uint16, 60000, 65535),
+        (np.uint32, 2**32, 2**32),
+    ],
 )
 def test_integers_are_scaled_by_the_full_scale_that_holds_them(rng, dtype, high, white):
     frames = stack(rng, dtype=dtype, high=high)
@@ -110,6 +116,15 @@ def test_a_crop_too_small_is_refused(rng):
         Burst(stack(rng, (3, 40, 50))).crop((0, 15), (0, 50))
 
 
+def test_levels_and_crops_that_leave_nothing_to_see_are_refused(rng):
+    frames = stack(rng, (3, 40, 50))
+    frames[:, :20] = 0
+    with pytest.raises(BurstError, match="every frame is constant"):
+        Burst(frames).crop((0, 20), (0, 50))
+    with pytest.raises(BurstError, match="every frame is constant"):
+        Burst(frames, black_level=254.5, white_level=1000).crop((0, 20), (0, 50))
+
+
 def bad_frames():
     ramp = np.arange(3 * 20 * 20.0).reshape(3, 20, 20)
     yield "one frame", ramp[:1], "at least 2 frames, got 1"
@@ -149,6 +164,11 @@ def test_bad_axes_are_refused(rng):
         ({"pixel_size": 0}, "positive"),
         ({"pixel_size": (1, float("nan"))}, "positive"),
         ({"times": [0, 1]}, "one finite time for each of the 3 frames"),
+        ({"times": "abc"}, "must be numbers"),
+        ({"pixel_size": (1, 2, 3)}, "one number or"),
+        ({"pixel_size": "a"}, "one number or"),
+        ({"black_level": "dark"}, "must be numbers"),
+        ({"axes": ("T", "Y", "X")}, "one letter per axis"),
     ],
 )
 def test_bad_metadata_is_refused(rng, known, said):

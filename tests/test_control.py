@@ -25,6 +25,13 @@ def test_pause_holds_and_resume_lets_go():
     assert not thread.is_alive()
 
 
+def test_a_pause_can_end_by_another_wish():
+    control = Control()
+    control.pause()
+    control.wait_while_paused(should_stop=lambda: True)
+    assert control.paused
+
+
 def test_pause_then_resume_at_once_ends_running():
     control = Control()
     control.pause()
@@ -43,9 +50,9 @@ def test_stop_ends_a_pause():
     assert control.stopped
 
 
-@pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf")])
+@pytest.mark.parametrize("value", [0, -1, float("nan"), float("inf"), "3"])
 def test_live_values_must_be_positive(value):
     control = Control()
     for name in ("sigma", "learning_rate"):
-        with pytest.raises(SettingsError, match=f"{name} must be a number above 0"):
+        with pytest.raises(SettingsError, match=f"{name} must be a number above 0 and of at most"):
             setattr(control, name, value)

@@ -40,7 +40,17 @@ def test_a_scale_that_does_not_divide_still_covers_the_bounds():
 
 
 @pytest.mark.parametrize(
-    ("bounds", "scale"), [((0, 0, 0, 5), 1), ((3, 0, 2, 5), 1), ((0, 0, 5, 5), 0), ((0, 0, 5, np.inf), 1)]
+    ("bounds", "scale"),
+    [
+        ((0, 0, 0, 5), 1),
+        ((3, 0, 2, 5), 1),
+        ((0, 0, 5, 5), 0),
+        ((0, 0, 5, np.inf), 1),
+        ((0, 0, 5), 1),
+        ("abcd", 1),
+        ((0, 0, 5, 5), "2"),
+        ((0, 0, 5, 5), 1e9),
+    ],
 )
 def test_empty_canvases_are_refused(bounds, scale):
     with pytest.raises(SettingsError, match="must be"):
@@ -116,6 +126,16 @@ def test_frames_are_numbered_as_in_python(result):
             result.frame(t)
 
 
+def test_frame_numbers_are_whole(result):
+    np.testing.assert_array_equal(result.frame(np.int64(2)), result.frame(2))
+    with pytest.raises(TypeError):
+        result.frame(1.0)
+
+
+def test_bounds_may_be_an_array(result):
+    np.testing.assert_array_equal(result.render(bounds=np.array([0, 0, 37, 31])), result.image)
+
+
 def test_compression_counts_bytes_as_they_came(result):
     assert result.compression == 1 - 4 * result.parameters / (5 * 31 * 37 * 3)
     assert result.parameters == sum(parameter.numel() for parameter in result.renderer.field.parameters())
@@ -142,6 +162,7 @@ def test_a_saved_representation_draws_the_same_picture(result, tmp_path):
 
 def test_a_loaded_representation_can_be_continued(result, fit, tiny_burst, tmp_path):
     again = load(result.save(tmp_path / "scene.npz"), device="cpu")
+    assert again.renderer.drawn == result.renderer.drawn > 0  # it goes on with fresh samples
     longer = fit(tiny_burst, initial=again, iterations=5, learning_rate=3e-3)
     assert len(longer.losses) == 65
     assert longer.losses[60:].mean() < result.losses[:5].mean()
@@ -159,7 +180,12 @@ def test_a_file_of_other_networks_is_refused(result, tmp_path):
     path = result.save(tmp_path / "scene.npz")
     with np.load(path) as stored:
         arrays = dict(stored)
-    del arrays["scene.network.0.weight"]
-    np.savez(tmp_path / "less.npz", **arrays)
-    with pytest.raises(OutputError, match="that this version can read"):
-        load(tmp_path / "less.npz")
+    provenance = json.loads(str(arrays["provenance"]))
+    damages = [{name: value for name, value in arrays.items() if name != "scene.network.0.weight"}]
+    for change in ({"losses": None}, {"settings": "x"}, {"burst": {}}, {"ending": None}):
+        damaged = {name: value for name, value in {**provenance, **change}.items() if value is not None}
+        damages.append({**arrays, "provenance": np.array(json.dumps(damaged))})
+    for number, damaged in enumerate(damages):
+        np.savez(tmp_path / f"{number}.npz", **damaged)
+        with pytest.raises(OutputError, match="that this version can read"):
+            load(tmp_path / f"{number}.npz")

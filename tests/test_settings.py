@@ -1,7 +1,9 @@
 """Settings: what a user may say, and what comes of it."""
 
 import json
+from fractions import Fraction
 
+import numpy as np
 import pytest
 
 from napari_fiberburst.errors import SettingsError
@@ -58,7 +60,7 @@ def test_a_settings_object_stands_for_a_name():
         ({"sgima": 3}, "is no setting; known with motion 'homography' with encoding 'fourier': .*sigma"),
         ({"encoding": "nerf", "sigma": 3.0}, "belongs to encoding 'fourier' and does not apply"),
         ({"tv_weight": 3.0}, "belongs to motion 'flow_tv'"),
-        ({"sigma": 0}, "sigma must be a number above 0; got 0"),
+        ({"sigma": 0}, r"sigma must be a number above 0 and of at most 1e\+06; got 0"),
         ({"sigma": -1.0}, "above 0"),
         ({"sigma": float("nan")}, "above 0"),
         ({"sigma": "wide"}, "a number"),
@@ -74,6 +76,12 @@ def test_a_settings_object_stands_for_a_name():
 def test_bad_choices_are_refused_with_what_is_known(choices, said):
     with pytest.raises(SettingsError, match=said):
         choose(**choices)
+
+
+def test_numbers_of_other_kinds_become_pythons_own():
+    settings = choose(seed=np.int64(3), sigma=Fraction(3, 2), iterations=np.uint8(4))
+    assert [type(settings.seed), type(settings.encoding.sigma), type(settings.iterations)] == [int, float, int]
+    assert settings == choose(seed=3, sigma=1.5, iterations=4)
 
 
 def test_a_settings_object_refuses_a_part_that_is_none():

@@ -138,6 +138,7 @@ class Burst(Acquisition):
         values -= np.float32(black)
         values /= np.float32(white - black)
         np.clip(values, 0, 1, out=values)
+        _check_contents(values)
         super().__init__(
             shape=values.shape,
             axes=order,
@@ -164,10 +165,11 @@ class Burst(Acquisition):
             The crop is empty, leaves the picture, or is under 16 pixels on a side.
         """
         for axis, (start, stop), size in zip("yx", (rows, columns), self.shape[1:3], strict=True):
-            if not 0 <= start < stop <= size:
+            if not all(isinstance(edge, int | np.integer) for edge in (start, stop)) or not 0 <= start < stop <= size:
                 raise BurstError(f"a crop must lie inside the picture, {axis} within 0:{size}; got {start}:{stop}")
         part = np.ascontiguousarray(self.frames[:, slice(*rows), slice(*columns)])
         _check_size(part.shape)
+        _check_contents(part)
         cropped = copy(self)
         _set(cropped, "shape", part.shape)
         _set(cropped, "origin", (self.origin[0] + rows[0], self.origin[1] + columns[0]))
@@ -190,6 +192,8 @@ def _as_tyxc(frames: Any, axes: str | None) -> tuple[Any, str]:
         frames = _stack(frames)
     if axes is None:
         axes = {3: "TYX", 4: "TYXC"}.get(frames.ndim, "")
+    if not isinstance(axes, str):
+        raise BurstError(f'axes must be one letter per axis, such as "CTYX"; got {axes!r}')
     axes = axes.upper().replace("S", "C")
     if not {"T", "Y", "X"} <= set(axes) or len(set(axes)) != len(axes) or len(axes) != frames.ndim:
         raise BurstError(
@@ -243,7 +247,6 @@ def _to_float(frames: Any) -> NDArray[np.float32]:
             f"frames must hold integers or floats, got {frames.dtype}; convert them to uint8, uint16 or float32"
         )
     values = np.empty(frames.shape, np.float32)
-    flat = True
     for index in range(len(values)):
         values[index] = np.asarray(frames[index])
         if not np.isfinite(values[index]).all():
@@ -251,12 +254,15 @@ def _to_float(frames: Any) -> NDArray[np.float32]:
                 f"frames must be finite, but frame {index} holds NaN or infinity; replace those pixels or leave "
                 "the frame out"
             )
-        flat &= bool(np.ptp(values[index]) == 0)
-    if flat:
-        raise BurstError(
-            "every frame is constant, so there is nothing to see; check the exposure and the file that was opened"
-        )
     return values
+
+
+def _check_contents(values: NDArray[np.float32]) -> None:
+    if all(np.ptp(frame) == 0 for frame in values):
+        raise BurstError(
+            "every frame is constant, so there is nothing to see; check the exposure, the levels, the crop, and the "
+            "file that was opened"
+        )
 
 
 def _levels(
@@ -266,9 +272,12 @@ def _levels(
     if dtype.kind == "f":
         low, full = min(low, 0.0), max(high, 1.0)
     else:
-        low, full = min(low, 0.0), float(next(full for full in _FULL_SCALES if full >= high))
-    black = low if black is None else float(black)
-    white = full if white is None else float(white)
+        low, full = min(low, 0.0), float(next((full for full in _FULL_SCALES if full >= high), high))
+    try:
+        black = low if black is None else float(black)
+        white = full if white is None else float(white)
+    except (TypeError, ValueError) as error:
+        raise BurstError(f"black and white level must be numbers; got {black!r} and {white!r}") from error
     if not (np.isfinite(black) and np.isfinite(white) and black < white):
         raise BurstError(f"the black level must be finite and below the white level; got {black:g} and {white:g}")
     return black, white
@@ -283,7 +292,10 @@ def _names(names: Sequence[str], channels: int) -> tuple[str, ...]:
 def _pixel_size(size: float | tuple[float, float] | None) -> tuple[float, float] | None:
     if size is None:
         return None
-    height, width = (float(side) for side in np.broadcast_to(size, 2))
+    try:
+        height, width = (float(side) for side in np.broadcast_to(size, 2))
+    except (TypeError, ValueError) as error:
+        raise BurstError(f"a pixel size must be one number or (height, width); got {size!r}") from error
     if not (0 < height < np.inf and 0 < width < np.inf):
         raise BurstError(f"a pixel size must be positive, one number or (height, width); got {size}")
     return height, width
@@ -292,7 +304,10 @@ def _pixel_size(size: float | tuple[float, float] | None) -> tuple[float, float]
 def _times(times: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
     if times is None:
         return None
-    values = np.array(times, dtype=np.float64)
+    try:
+        values = np.array(times, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BurstError(f"frame times must be numbers, in seconds; got {times!r}") from error
     if values.shape != (count,) or not np.isfinite(values).all():
         raise BurstError(f"expected one finite time for each of the {count} frames; got {times}")
     return values

@@ -1,8 +1,15 @@
 """A handle on a running reconstruction, safe to use from another thread."""
 
 import threading
+from collections.abc import Callable
 
 from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.knobs import knobs_of
+from napari_fiberburst.settings import Fourier, Settings
+
+_KNOBS = {"sigma": knobs_of(Fourier)["sigma"], "learning_rate": knobs_of(Settings)["learning_rate"]}
+# How often a paused run asks whether it should end.
+_SECONDS_BETWEEN_LOOKS = 0.1
 
 
 class Control:
@@ -53,29 +60,34 @@ class Control:
 
     @property
     def sigma(self) -> float | None:
-        """Frequency spread of the Fourier encoding; None, as at the start, leaves the settings' value."""
+        """Frequency spread of the Fourier encoding to go on with; None leaves it as it is."""
         return self._sigma
 
     @sigma.setter
-    def sigma(self, value: float) -> None:
-        self._sigma = _positive("sigma", value)
+    def sigma(self, value: float | None) -> None:
+        self._sigma = _checked("sigma", value)
 
     @property
     def learning_rate(self) -> float | None:
-        """Step size of Adam; None, as at the start, leaves the settings' value."""
+        """Step size of Adam to go on with; None leaves it as it is."""
         return self._learning_rate
 
     @learning_rate.setter
-    def learning_rate(self, value: float) -> None:
-        self._learning_rate = _positive("learning_rate", value)
+    def learning_rate(self, value: float | None) -> None:
+        self._learning_rate = _checked("learning_rate", value)
 
-    def wait_while_paused(self) -> None:
-        """Block while paused; a stop ends the pause."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._stopped or not self._paused)
+    def wait_while_paused(self, should_stop: Callable[[], bool] | None = None) -> None:
+        """Block while paused; a stop ends the pause, and so does `should_stop` where it returns True."""
+        while self._paused and not self._stopped:
+            if should_stop is not None and should_stop():
+                return
+            with self._changed:
+                self._changed.wait_for(lambda: self._stopped or not self._paused, timeout=_SECONDS_BETWEEN_LOOKS)
 
 
-def _positive(name: str, value: float) -> float:
-    if not 0 < value < float("inf"):
-        raise SettingsError(f"{name} must be a number above 0; got {value!r}")
-    return float(value)
+def _checked(name: str, value: float | None) -> float | None:
+    """Return a live value by the rule that its setting has."""
+    knob = _KNOBS[name]
+    if value is not None and not knob.allows(value):
+        raise SettingsError(f"{name} must be {knob.expected}; got {value!r}")
+    return value

@@ -54,7 +54,8 @@ class Knob:
         else:
             words = {int: "an integer", float: "a number", str: "a text"}[self.kind]
             bounds = [("of at least", self.least), ("above", self.above), ("of at most", self.most)]
-            words = " ".join([words, *(f"{text} {bound:g}" for text, bound in bounds if bound is not None)])
+            limits = " and ".join(f"{text} {bound:g}" for text, bound in bounds if bound is not None)
+            words = f"{words} {limits}".strip()
         return f"{words}, or None" if self.optional else words
 
     def allows(self, value: object) -> bool:
@@ -111,6 +112,8 @@ def knobs_of(settings_type: type) -> dict[str, Knob]:
 def check(settings: object) -> None:
     """Refuse a settings object with a value of the wrong type or out of range.
 
+    Numbers of other kinds, such as numpy's, become Python's own, which every later use can take.
+
     Raises
     ------
     SettingsError
@@ -120,6 +123,8 @@ def check(settings: object) -> None:
         value = getattr(settings, name)
         if not knob.allows(value):
             raise SettingsError(f"{name} must be {knob.expected}; got {value!r}")
+        if value is not None:
+            object.__setattr__(settings, name, knob.kind(value))  # of a frozen dataclass, while it is made
 
 
 def _declared(settings_type: type) -> Iterator[Field[Any]]:

@@ -1,6 +1,7 @@
 """Reconstruction: the picture a burst gave, how its frames lie on it, and where it all came from."""
 
 from dataclasses import dataclass, field
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -9,8 +10,11 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.burst import Acquisition
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.io.results import write_picture, write_representation
+from napari_fiberburst.io.results import is_representation, write_picture, write_representation
 from napari_fiberburst.settings import Settings
+
+_BAND_PIXELS = 2**17
+_MOST_PIXELS = 2**31
 
 Ending = Literal["finished", "stopped", "time budget", "diverged"]
 
@@ -47,25 +51,45 @@ class Canvas:
         SettingsError
             The bounds are empty or the scale is not positive.
         """
-        x0, y0, x1, y1 = bounds
-        if not (x0 < x1 and y0 < y1 and np.isfinite([x0, y0, x1, y1]).all()):
+        edges = np.array(bounds)
+        if edges.shape != (4,) or edges.dtype.kind not in "iuf" or not np.isfinite(edges).all():
+            raise SettingsError(f"bounds must be four numbers x0, y0, x1, y1; got {bounds}")
+        x0, y0, x1, y1 = edges.astype(np.float64).tolist()
+        if not (x0 < x1 and y0 < y1):
             raise SettingsError(f"bounds must be x0, y0, x1, y1 with x0 < x1 and y0 < y1; got {bounds}")
-        if not 0 < scale < np.inf:
-            raise SettingsError(f"scale must be a number above 0; got {scale}")
+        if isinstance(scale, str) or not 0 < scale < np.inf:
+            raise SettingsError(f"scale must be a number above 0; got {scale!r}")
         width, height = (max(1, round((stop - start) * scale)) for start, stop in ((x0, x1), (y0, y1)))
+        if width * height > _MOST_PIXELS:
+            raise SettingsError(
+                f"a picture of {height} x {width} pixels must be drawn in parts; got bounds {bounds} at scale {scale:g}"
+            )
         step_x, step_y = (x1 - x0) / width, (y1 - y0) / height
         # Pixel edges meet the bounds, so the first centre lies half a step inside them.
         first_x, first_y = x0 - 0.5 + step_x / 2, y0 - 0.5 + step_y / 2
         matrix = np.array([[step_x, 0, first_x], [0, step_y, first_y], [0, 0, 1]], dtype=np.float64)
         return cls(shape=(height, width), frame0_from_image=matrix)
 
-    def points(self) -> NDArray[np.float64]:
-        """Return the frame-0 point (x, y) of every pixel, (H, W, 2)."""
-        rows, columns = np.indices(self.shape, dtype=np.float64)
-        pixels = np.stack([columns, rows, np.ones(self.shape)], axis=-1)
-        mapped = pixels @ self.frame0_from_image.T
+    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.float64]:
+        """Return the frame-0 point (x, y) of every pixel of rows `first` up to `last`, (rows, W, 2)."""
+        height, width = self.shape
+        columns, rows = np.meshgrid(np.arange(width), np.arange(height)[first:last])
+        mapped = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ self.frame0_from_image.T
         points: NDArray[np.float64] = mapped[..., :2] / mapped[..., 2:]
         return points
+
+
+def draw(renderer: "Renderer", canvas: Canvas, frame: int, acquisition: Acquisition) -> NDArray[np.float32]:
+    """Draw the scene as `frame` sees it, on a canvas in that frame's pixels, in the recording's intensity units.
+
+    Rows are drawn some at a time, so that what is in memory beside the picture does not grow with it.
+    """
+    height, width = canvas.shape
+    band = max(1, _BAND_PIXELS // width)
+    picture = np.empty((height, width, acquisition.shape[3]), np.float32)
+    for first in range(0, height, band):
+        picture[first : first + band] = renderer.render(canvas.points(first, first + band), frame)
+    return acquisition.in_original_units(picture)
 
 
 class Renderer(Protocol):
@@ -100,7 +124,7 @@ class Reconstruction:
     settings : Settings
         What it was made with.
     seconds : float
-        Time it took, pauses left out, the run it continued included.
+        Time from the first step on, pauses left out, the run it continued included.
     parameters : int
         Numbers that were fitted.
     compression : float
@@ -154,7 +178,8 @@ class Reconstruction:
         SettingsError
             The bounds are empty or the scale is not positive.
         """
-        return self._draw(Canvas.over(bounds or self._field, scale).points(), 0)
+        canvas = Canvas.over(self._field if bounds is None else bounds, scale)
+        return draw(self.renderer, canvas, 0, self.acquisition)
 
     def frame(self, t: int, scale: float = 1.0) -> NDArray[np.float32]:
         """Draw the clean scene as frame t sees it, I_hat(x, y, t) = f(gamma(T_g(x, y, t))).
@@ -175,8 +200,10 @@ class Reconstruction:
         ------
         IndexError
             There is no such frame.
+        SettingsError
+            The scale is not positive.
         """
-        return self._draw(Canvas.over(self._field, scale).points(), self._number(t))
+        return draw(self.renderer, Canvas.over(self._field, scale), self._number(t), self.acquisition)
 
     def flow(self, t: int) -> NDArray[np.float64]:
         """Return how far frame t's pixels are from where frame 0 shows the same point of the object.
@@ -226,7 +253,7 @@ class Reconstruction:
         path : str or Path
             ``.ome.tif`` (or ``.tif``): the image as OME-TIFF with pixel size and channel names, and its
             provenance as JSON beside it. ``.npz``: the compressed representation, which
-            `napari_fiberburst.load` reads back to be rendered at any size or continued.
+            `napari_fiberburst.load` reads back to be rendered at any size or continued (without Adam's moments).
 
         Returns
         -------
@@ -239,7 +266,7 @@ class Reconstruction:
             The folder does not exist or cannot be written, or the ending is not one of these. Files are replaced
             whole: a killed run leaves the old one or the new one, never half of one.
         """
-        if Path(path).suffix == ".npz":
+        if is_representation(Path(path)):
             return write_representation(path, self.renderer.arrays(), self.provenance())
         return write_picture(path, self.image, self.acquisition, self.provenance())
 
@@ -247,11 +274,8 @@ class Reconstruction:
     def _field(self) -> tuple[float, float, float, float]:
         return 0, 0, self.acquisition.shape[2], self.acquisition.shape[1]
 
-    def _draw(self, points: NDArray[np.float64], t: int) -> NDArray[np.float32]:
-        return self.acquisition.in_original_units(self.renderer.render(points, t))
-
     def _number(self, t: int) -> int:
-        count = len(self.homographies)
+        count, t = len(self.homographies), index(t)
         if not -count <= t < count:
             raise IndexError(f"frame {t} of a burst of {count}")
         return t % count

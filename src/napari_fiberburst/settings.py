@@ -36,11 +36,12 @@ class Fourier:
     """Random Fourier features (Tancik et al., 2020)."""
 
     name: ClassVar[str] = "fourier"
-    features: int = knob(256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1)
+    features: int = knob(256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1, most=2**16)
     sigma: float = knob(
         5.0,
         "Frequency spread, cycles per half frame; more resolves finer detail, and in the end the honeycomb.",
         above=0,
+        most=1e6,
     )
 
     def __post_init__(self) -> None:
@@ -53,10 +54,10 @@ class Hash:
 
     name: ClassVar[str] = "hash"
     levels: int = knob(12, "Grid levels; more resolve finer detail.", least=1, most=24)
-    level_features: int = knob(2, "Learned values per grid point; more can hold more, at more cost.", least=1)
+    level_features: int = knob(2, "Learned values per grid point; more can hold more, at more cost.", least=1, most=64)
     table_bits: int = knob(16, "Binary log of the table length; more means fewer collisions.", least=4, most=24)
-    base_resolution: int = knob(4, "Cells across the frame at the coarsest level.", least=1)
-    growth: float = knob(1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1)
+    base_resolution: int = knob(4, "Cells across the frame at the coarsest level.", least=1, most=4096)
+    growth: float = knob(1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1, most=2)
 
     def __post_init__(self) -> None:
         check(self)
@@ -67,7 +68,7 @@ class Siren:
     """Sine activations instead of an encoding (Sitzmann et al., 2020)."""
 
     name: ClassVar[str] = "siren"
-    omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0)
+    omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4)
 
     def __post_init__(self) -> None:
         check(self)
@@ -82,8 +83,8 @@ class NoMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _MotionNetwork:
-    motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1)
-    motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1)
+    motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1, most=64)
+    motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
 
     def __post_init__(self) -> None:
         check(self)
@@ -102,7 +103,7 @@ class Flow(_MotionNetwork):
 
     name: ClassVar[str] = "flow"
     flow_omega_0: float = knob(
-        30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0
+        30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0, most=1e4
     )
 
 
@@ -140,10 +141,12 @@ class Settings:
 
     motion: Motion = field(default_factory=Homography)
     encoding: Encoding = field(default_factory=Fourier)
-    scene_layers: int = knob(4, "Hidden layers of the scene network.", least=1)
-    scene_width: int = knob(256, "Units per hidden layer of the scene network; more holds more detail.", least=1)
+    scene_layers: int = knob(4, "Hidden layers of the scene network.", least=1, most=64)
+    scene_width: int = knob(
+        256, "Units per hidden layer of the scene network; more holds more detail.", least=1, most=2**14
+    )
     iterations: int = knob(3000, "Optimisation steps; more fits closer, in the end noise too.", least=1)
-    learning_rate: float = knob(1e-4, "Step size of Adam; more is faster and less stable.", above=0)
+    learning_rate: float = knob(1e-4, "Step size of Adam; more is faster and less stable.", above=0, most=1e6)
     batch: int | None = knob(None, "Samples per step; None takes an eighth of a frame's pixels, as published.", least=1)
     seed: int = knob(0, "Seed of everything random; the same seed gives the same picture.", least=0, most=2**31 - 1)
     device: str = knob("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
@@ -185,6 +188,8 @@ class Settings:
         return choose(**flat)
 
 
+_ALL_NAMES = {item.name for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()) for item in fields(owner)}
+
 PRESETS: Mapping[str, Settings] = {"paper": Settings()}
 
 
@@ -205,6 +210,9 @@ def choose(preset: str | Settings = "paper", **choices: Any) -> Settings:
         A name is unknown, does not apply to the choice made, or a value is out of range. The known ones are listed.
     """
     settings = preset if isinstance(preset, Settings) else PRESETS[_known("preset", preset, PRESETS)]
+    for name in choices:
+        if name not in _ALL_NAMES:
+            raise SettingsError(_misplaced(name, settings, settings.motion, settings.encoding))
     given = {name: value for name, value in choices.items() if value is not None}
     motion = _part("motion", given.pop("motion", settings.motion), settings.motion, MOTIONS)
     encoding = _part("encoding", given.pop("encoding", settings.encoding), settings.encoding, ENCODINGS)

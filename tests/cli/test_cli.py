@@ -64,7 +64,7 @@ def test_reconstruct_can_write_the_networks(burst_file, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (["--sigma", "-1"], "sigma must be a number above 0"),
+        (["--sigma", "-1"], "sigma must be a number above 0 and"),
         (["--encoding", "siren", "--sigma", "3"], "belongs to encoding 'fourier'"),
         (["--crop", "0:99,0:20"], "within 0:33"),
         (["--device", "cuda:77"], "is not on this machine"),
@@ -78,6 +78,30 @@ def test_bad_input_says_why_and_leaves_no_file(burst_file, tmp_path, capsys, cha
     assert main(["reconstruct", str(burst_file), *out, *change]) == 2
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [burst_file]
+
+
+def test_the_burst_is_not_written_over(burst_file, capsys):
+    before = burst_file.read_bytes()
+    assert main(["reconstruct", str(burst_file), "-o", str(burst_file), "--iterations", "1", *SMALL]) == 2
+    assert "would be lost" in capsys.readouterr().err
+    assert burst_file.read_bytes() == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
+def test_ctrl_c_while_saving_lets_the_saving_end(burst_file, tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def interrupted(number):
+        signal.raise_signal(signal.SIGINT) if os.fsync is interrupted and not seen else None
+        seen.append(number)
+        fsync(number)
+
+    seen = []
+    monkeypatch.setattr(os, "fsync", interrupted)
+    out = tmp_path / "picture.tif"
+    assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "2", *SMALL]) == 0
+    assert out.exists()
+    assert (tmp_path / "picture.json").exists()
 
 
 def test_a_missing_burst_is_said(tmp_path, capsys):

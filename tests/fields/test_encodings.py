@@ -101,6 +101,11 @@ def test_points_beyond_the_stored_margin_hold_the_nearest_value():
     np.testing.assert_allclose(grid(far).detach(), grid(near).detach(), atol=1e-9)
 
 
+def test_points_that_are_no_numbers_give_no_numbers():
+    grid = HashGrid(2, Hash(levels=2), seeded())
+    assert grid(torch.tensor([[torch.nan, 0.1]])).isnan().all()
+
+
 def test_siren_is_sines_of_thirty_times_its_layers():
     network = make_siren([2, 4, 1], 30.0, seeded())
     first, last = network[0], network[2]

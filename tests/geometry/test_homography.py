@@ -29,6 +29,13 @@ def test_gradients_agree_with_finite_differences(rng):
     assert torch.autograd.gradcheck(apply, (matrices, points), eps=1e-6, atol=1e-7)
 
 
+def test_a_frame_0_seen_edge_on_leaves_nothing_to_say():
+    matrices = np.stack([np.diag([1.0, 0, 1]), np.eye(3)])
+    found = relative_to_first(matrices)
+    np.testing.assert_array_equal(found[0], np.eye(3))
+    assert np.isnan(found[1]).all()
+
+
 def test_relative_to_first_removes_the_gauge(rng):
     truth, gauge = near_identity(rng, 5), near_identity(rng, 1)[0]
     truth[0] = np.eye(3)

@@ -78,8 +78,62 @@ def test_imagej_tiff_with_what_it_knows(tmp_path, frames):
     burst = read_burst(tmp_path / "burst.tif")
     assert_holds(burst, frames)
     assert burst.pixel_size == pytest.approx((0.25, 0.5))
-    assert burst.unit == "um"
+    assert burst.unit == "µm"
     np.testing.assert_allclose(burst.times, 0.1 * np.arange(12))
+
+
+def test_pages_that_are_a_series_each(tmp_path, frames):
+    with tifffile.TiffWriter(tmp_path / "burst.tif") as writer:
+        for frame in frames:
+            writer.write(frame)
+    assert_holds(read_burst(tmp_path / "burst.tif"), frames)
+
+
+def test_pages_of_two_sizes_are_refused(tmp_path, frames):
+    with tifffile.TiffWriter(tmp_path / "burst.tif") as writer:
+        writer.write(frames, photometric="minisblack")
+        writer.write(frames[:3, :16, :16], photometric="minisblack")
+    with pytest.raises(BurstError, match=r"pages of different sizes or types, \(12, 17, 23\), \(3, 16, 16\)"):
+        read_burst(tmp_path / "burst.tif")
+
+
+def test_a_palette_stands_for_its_colours(tmp_path, rng):
+    indices = rng.integers(0, 256, (3, 17, 23), dtype=np.uint8)
+    colormap = rng.integers(0, 65536, (3, 256)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "burst.tif", indices, photometric="palette", colormap=colormap)
+    assert_holds(read_burst(tmp_path / "burst.tif"), np.moveaxis(colormap[:, indices], 0, -1))
+
+
+def test_alpha_is_no_light(tmp_path, rng):
+    frames = rng.integers(0, 256, (3, 17, 23, 4), dtype=np.uint8)
+    tifffile.imwrite(tmp_path / "burst.tif", frames, photometric="rgb", extrasamples=["unassalpha"])
+    assert_holds(read_burst(tmp_path / "burst.tif"), frames[..., :3])
+
+
+@pytest.mark.parametrize("kind", ["ome", "imagej"])
+def test_frames_along_z_keep_their_times(tmp_path, frames, kind):
+    if kind == "ome":
+        metadata = {"axes": "ZYX", "TimeIncrement": 100.0, "TimeIncrementUnit": "ms"}
+        tifffile.imwrite(tmp_path / "burst.tif", frames, ome=True, metadata=metadata, photometric="minisblack")
+    else:
+        tifffile.imwrite(tmp_path / "burst.tif", frames, imagej=True, metadata={"axes": "ZYX", "finterval": 0.1})
+    burst = read_burst(tmp_path / "burst.tif")
+    assert_holds(burst, frames)
+    np.testing.assert_allclose(burst.times, 0.1 * np.arange(12))
+
+
+def test_metadata_that_cannot_be_is_left_out(tmp_path, frames, caplog):
+    zero = {"axes": "TYX", "PhysicalSizeX": 0.0, "PhysicalSizeY": 0.0}
+    tifffile.imwrite(tmp_path / "ome.tif", frames, ome=True, metadata=zero, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "odd.tif", frames, ome=True, metadata={"axes": "TYX", "TimeIncrementUnit": "yd"})
+    tifffile.imwrite(
+        tmp_path / "ij.tif", frames, imagej=True, resolution=((0, 1), (0, 1)), metadata={"axes": "TYX", "unit": "um"}
+    )
+    for name in ("ome.tif", "odd.tif", "ij.tif"):
+        burst = read_burst(tmp_path / name)
+        assert_holds(burst, frames)
+        assert burst.pixel_size is None
+    assert "ignoring" in caplog.text
 
 
 def test_axes_can_be_corrected(tmp_path, colour):
@@ -92,6 +146,28 @@ def test_a_folder_in_natural_order(tmp_path, frames, ending):
     for index, frame in enumerate(frames):
         iio.imwrite(tmp_path / f"frame{index}.{ending}", frame)  # frame10 sorts before frame2 by letters
     (tmp_path / "notes.txt").write_text("not a frame")
+    assert_holds(read_burst(tmp_path), frames)
+
+
+def test_a_folder_of_tiffs_with_channels(tmp_path, colour):
+    for index, frame in enumerate(colour):
+        planes = np.moveaxis(frame, 2, 0)
+        tifffile.imwrite(tmp_path / f"{index}.ome.tif", planes, metadata={"axes": "CYX"}, photometric="minisblack")
+    assert_holds(read_burst(tmp_path), colour)
+
+
+def test_a_folder_of_stacks_is_refused(tmp_path, frames):
+    for index in range(3):
+        tifffile.imwrite(tmp_path / f"{index}.tif", frames, photometric="minisblack")
+    with pytest.raises(BurstError, match="must hold one frame, got shape"):
+        read_burst(tmp_path)
+
+
+def test_hidden_files_and_folders_are_passed_over(tmp_path, frames):
+    for index, frame in enumerate(frames):
+        iio.imwrite(tmp_path / f"{index}.png", frame)
+    (tmp_path / "._0.png").write_bytes(b"notes of some system")
+    (tmp_path / "old.tif").mkdir()
     assert_holds(read_burst(tmp_path), frames)
 
 
@@ -129,7 +205,7 @@ def test_colour_png_of_16_bits_is_refused_rather_than_rounded(tmp_path):
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, 2, 0, 0, 0))
     pixels = chunk(b"IDAT", zlib.compress(bytes(7)))
     (tmp_path / "0.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))
-    with pytest.raises(BurstError, match="save the frames as TIFF"):
+    with pytest.raises(BurstError, match="save it as TIFF"):
         read_burst(tmp_path)
 
 
@@ -161,7 +237,7 @@ def test_ome_zarr(tmp_path, colour, version):
     burst = read_burst(path)
     assert_holds(burst, colour)
     assert burst.pixel_size == (0.75, 0.6)
-    assert burst.unit == "micrometer"
+    assert burst.unit == "µm"
     assert burst.channel_names == ("r", "g", "b")
     np.testing.assert_allclose(burst.times, [0, 0.5, 1, 1.5])
 
@@ -189,7 +265,7 @@ def test_a_tiff_cut_anywhere_is_refused_or_whole(tmp_path, frames, kind):
         tifffile.imwrite(whole, frames, photometric="minisblack", **choices)
     data = whole.read_bytes()
     cut = tmp_path / "cut.tif"
-    for length in {0, 3, 4, 8, 16, 100, *range(200, len(data), len(data) // 23)}:
+    for length in {0, 3, 4, 8, 16, 100, *range(200, len(data), len(data) // 89)}:
         cut.write_bytes(data[:length])
         try:
             burst = read_burst(cut)
@@ -213,6 +289,8 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
     np.savez(tmp_path / "several.npz", a=frames, b=frames)
     np.savez(tmp_path / "objects.npz", frames=np.array([{}, {}], dtype=object))
     zarr.open_group(str(tmp_path / "plain.zarr"), mode="w")
+    np.savez(tmp_path / "axes.npz", frames=frames, axes=np.array(3))
+    np.savez(tmp_path / "level.npz", frames=frames, black_level=np.array("dark"))
     tifffile.imwrite(tmp_path / "single.tif", frames[0])
     for name, said in (
         ("missing.tif", "there is no .*expected a TIFF stack"),
@@ -227,6 +305,9 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
         ("several.npz", "named 'frames'; it has a, b"),
         ("objects.npz", "cannot be read as npz"),
         ("plain.zarr", "no OME-Zarr image"),
+        ("axes.npz", "must give its axes as text"),
+        ("level.npz", "levels? must be numbers"),
+        ("a" * 300 + ".tif", "cannot be opened"),
         ("single.tif", r"single.tif: a burst is one stack .* got shape \(17, 23\)"),
     ):
         with pytest.raises(BurstError, match=said):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from napari_fiberburst import Burst, read_burst
+from napari_fiberburst import Burst, load, read_burst
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.results import check_output, sidecar_of, write_whole
 
@@ -71,6 +71,63 @@ def test_places_that_cannot_be_written_are_refused(fit, tiny_burst, tmp_path, pl
     with pytest.raises(OutputError, match=said):
         fit(tiny_burst).save(tmp_path / place)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.tif"]
+
+
+@pytest.mark.parametrize("name", ["scene.npz", "SCENE.NPZ", ".npz"])
+def test_networks_go_into_npz_however_it_is_written(fit, tiny_burst, tmp_path, name):
+    result = fit(tiny_burst)
+    np.testing.assert_array_equal(load(result.save(tmp_path / name), device="cpu").image, result.image)
+
+
+def test_what_is_not_ours_is_not_replaced(fit, tiny_burst, tmp_path):
+    (tmp_path / "raw.json").write_text('{"exposure": 3}')
+    (tmp_path / "list.json").write_text("[1]")
+    (tmp_path / "folder.json").mkdir()
+    result = fit(tiny_burst)
+    for name, said in (("raw.tif", "not of napari-fiberburst"), ("list.tif", "not of"), ("folder.tif", "is a folder")):
+        with pytest.raises(OutputError, match=said):
+            result.save(tmp_path / name)
+    assert (tmp_path / "raw.json").read_text() == '{"exposure": 3}'
+    result.save(tmp_path / "new.tif")
+    result.save(tmp_path / "new.tif")  # a result of ours gives way to another
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "folder.json",
+        "list.json",
+        "new.json",
+        "new.tif",
+        "raw.json",
+    ]
+
+
+def test_the_source_of_a_result_is_not_replaced(tmp_path):
+    (tmp_path / "burst.tif").write_bytes(b"frames")
+    with pytest.raises(OutputError, match="would be lost"):
+        check_output(tmp_path / "burst.tif", source=tmp_path / "burst.tif")
+
+
+def test_a_picture_and_its_provenance_appear_together_or_not_at_all(fit, tiny_burst, tmp_path, monkeypatch):
+    result = fit(tiny_burst)
+    synced = []
+
+    def fail_at_the_second(number):
+        synced.append(number)
+        if len(synced) == 2:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail_at_the_second)
+    with pytest.raises(OutputError, match="No space left"):
+        result.save(tmp_path / "picture.tif")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert "picture.tif" not in names
+    assert not any(name.endswith(".part") for name in names)
+
+
+def test_a_unit_that_ome_does_not_know_stands_in_the_json_alone(fit, rng, tmp_path):
+    burst = Burst(rng.random((3, 17, 23)), pixel_size=2, unit="furlong")
+    fit(burst).save(tmp_path / "picture.tif")
+    with tifffile.TiffFile(tmp_path / "picture.tif") as file:
+        assert "PhysicalSize" not in file.ome_metadata
+    assert json.loads((tmp_path / "picture.json").read_text())["burst"]["unit"] == "furlong"
 
 
 def test_a_folder_without_permission_is_refused(tmp_path, monkeypatch):

@@ -96,6 +96,22 @@ def test_a_core_shows_the_mean_of_the_scene_over_its_area():
     np.testing.assert_allclose(shown, expected, atol=0.01)
 
 
+@pytest.mark.parametrize(("bits", "exposure"), [(8, 1.0), (9, 1.0), (12, 0.2), (16, 0.1)])
+def test_full_scale_is_the_cameras(bits, exposure):
+    camera = Camera(photons=1e12, read_noise=0, bits=bits, exposure=exposure)
+    simulated = simulate(shape=SHAPE, frames=2, camera=camera)
+    expected = exposure * simulated.truth * simulated.transmission[..., None]
+    np.testing.assert_allclose(simulated.burst.frames, expected, atol=0.51 / (2**bits - 1) + 2e-6)
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.3])
+def test_cores_show_an_even_scene_as_the_transmission(crosstalk):
+    white = Scene(np.ones((20, 20, 1), np.float32))
+    camera = Camera(photons=1e12, read_noise=0)
+    simulated = simulate(white, shape=SHAPE, frames=2, physics="core", camera=camera, crosstalk=crosstalk)
+    np.testing.assert_allclose(simulated.burst.frames[1, ..., 0], simulated.transmission, atol=0.51 / 255)
+
+
 def test_a_core_has_no_detail_inside():
     camera = Camera(photons=1e12, read_noise=0, bits=16)
     simulated = simulate("tissue", shape=SHAPE, frames=2, pitch=12.0, physics="core", camera=camera)
@@ -198,13 +214,21 @@ def test_usaf_elements_grow_finer_by_the_sixth_root_of_two(rng):
         ({"scene": "dog"}, "known: histology"),
         ({"motion": "jump"}, "known: brownian"),
         ({"motion": np.zeros((2, 3, 3))}, "begin with the identity"),
+        ({"motion": np.stack([np.eye(3), np.zeros((3, 3))])}, "must have an inverse"),
+        ({"motion": np.eye(3)}, "must have shape"),
         ({"physics": "wave"}, "known: mask, core"),
-        ({"frames": 1}, "at least 2 frames"),
-        ({"shape": (8, 40)}, "at least 16"),
+        ({"frames": 1}, "frames must be an integer of at least 2"),
+        ({"frames": 3.0}, "frames must be an integer"),
+        ({"shape": (8, 40)}, "height must be an integer of at least 16"),
+        ({"shape": (40,)}, "shape must be"),
+        ({"channels": 0}, "channels must be"),
+        ({"seed": -1}, "seed must be"),
+        ({"jitter": -1}, "jitter must be"),
+        ({"pitch": "3"}, "pitch must be"),
         ({"pitch": 1.0}, "pitch must be from 2"),
         ({"dead_cores": 1.0}, "dead_cores must be"),
         ({"outline": "star"}, "known: frame, circle"),
-        ({"ptich": 3.0}, "unknown setting of the bundle"),
+        ({"ptich": 3.0}, "unknown setting 'ptich'; known of the bundle: pitch"),
     ],
 )
 def test_bad_choices_are_refused(choices, said):
@@ -213,5 +237,6 @@ def test_bad_choices_are_refused(choices, said):
 
 
 def test_a_camera_that_cannot_be_is_refused():
-    with pytest.raises(SettingsError, match="8 to 16 bits"):
-        Camera(bits=4)
+    for impossible in ({"bits": 4}, {"bits": 8.5}, {"photons": float("nan")}, {"exposure": -1}, {"pedestal": 1}):
+        with pytest.raises(SettingsError, match="8 to 16 bits"):
+            Camera(**impossible)

@@ -2,20 +2,24 @@
 
 import argparse
 import logging
+import signal
 import sys
 from collections.abc import Sequence
 
 from napari_fiberburst import __version__
 from napari_fiberburst.cli import demo, info, reconstruct, simulate
+from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import FiberBurstError
 
-INTERRUPTED = 130
+TERMINATED = 143
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0, 2 for input it cannot use, 130 when interrupted."""
     logging.basicConfig(format="fiberburst: %(message)s", level=logging.WARNING)
     options = _parser().parse_args(arguments)
+    # A run that is told to end, as by a batch queue, takes its half-written files with it.
+    before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED))
     try:
         status: int = options.run(options)
     except FiberBurstError as error:
@@ -24,6 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\nfiberburst: interrupted; nothing was written", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return status
 
 

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.quality import match_levels, motion_error, psnr, ssim
 from napari_fiberburst.simulation import simulate
 
@@ -42,32 +42,34 @@ def run(options: argparse.Namespace) -> int:
         raise OutputError(f"the demo draws a .png file; got {options.output}")
     from napari_fiberburst.solver import Progress, reconstruct
 
+    check_place(options.output)
+    simulated = simulate(**_BURST)  # type: ignore[arg-type]
+    print(f"simulated: {simulated.burst}, cores {_BURST['pitch']} px apart, object moving")
+    settings = {**_SETTINGS, "iterations": options.iterations, "device": options.device}
+    with tqdm(total=options.iterations, unit="it", desc="reconstructing") as bar:
+
+        def show(report: Progress) -> None:
+            bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
+            bar.update(report.step - bar.n)
+
+        result = reconstruct(simulated.burst, **settings, on_progress=show)
+    truth = simulated.truth[0]
+    captured = simulated.burst.frames[0]
+    pictures = {
+        "captured frame": captured,
+        "Gaussian filter": _best_gaussian(captured, truth),
+        "reconstruction": result.image / np.float32(simulated.burst.white_level),
+    }
+    print(f"{'':16}  PSNR dB   SSIM   (frame 0, after one gain and offset per channel)")
+    for name, picture in pictures.items():
+        print(f"{name:16}  {psnr(picture, truth):7.2f}  {ssim(picture, truth):5.3f}")
+    shape = truth.shape[:2]
+    error = motion_error(result.homographies, simulated.homographies, shape)
+    still = motion_error(np.broadcast_to(np.eye(3), (len(simulated.truth), 3, 3)), simulated.homographies, shape)
+    print(f"motion off by {error:.2f} px on average; unregistered {still:.2f} px")
+    sheet = _side_by_side({**pictures, "truth": truth}, truth)
     with write_whole(options.output) as stream:
-        simulated = simulate(**_BURST)  # type: ignore[arg-type]
-        print(f"simulated: {simulated.burst}, cores {_BURST['pitch']} px apart, object moving")
-        settings = {**_SETTINGS, "iterations": options.iterations, "device": options.device}
-        with tqdm(total=options.iterations, unit="it", desc="reconstructing") as bar:
-
-            def show(report: Progress) -> None:
-                bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
-                bar.update(report.step - bar.n)
-
-            result = reconstruct(simulated.burst, **settings, on_progress=show)
-        truth = simulated.truth[0]
-        captured = simulated.burst.frames[0]
-        pictures = {
-            "captured frame": captured,
-            "Gaussian filter": _best_gaussian(captured, truth),
-            "reconstruction": result.image / np.float32(simulated.burst.white_level),
-        }
-        print(f"{'':16}  PSNR dB   SSIM   (frame 0, after one gain and offset per channel)")
-        for name, picture in pictures.items():
-            print(f"{name:16}  {psnr(picture, truth):7.2f}  {ssim(picture, truth):5.3f}")
-        shape = truth.shape[:2]
-        error = motion_error(result.homographies, simulated.homographies, shape)
-        still = motion_error(np.broadcast_to(np.eye(3), (len(simulated.truth), 3, 3)), simulated.homographies, shape)
-        print(f"motion off by {error:.2f} px on average; unregistered {still:.2f} px")
-        stream.write(_side_by_side({**pictures, "truth": truth}, truth))
+        stream.write(sheet)
     print(f"{result.seconds:.0f} s on {result.device}; wrote {options.output}")
     return 0
 

@@ -17,6 +17,8 @@ from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.results import check_output
 from napari_fiberburst.settings import choose
 
+INTERRUPTED = 130
+
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
@@ -43,7 +45,7 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, fit, write. Returns 130 where the fit was interrupted, though its picture was written."""
-    check_output(options.output)
+    check_output(options.output, options.input)
     choices = settings_of(options)
     settings = choose(**choices)
     burst = read_burst(
@@ -63,14 +65,14 @@ def run(options: argparse.Namespace) -> int:
             bar.update(report.step - bar.n)
 
         result = reconstruct(burst, **choices, control=control, on_progress=show)
-    result.save(options.output)
+        result.save(options.output)
     steps = len(result.losses)
     rate = steps / result.seconds
     print(f"{result.ending} after {steps} steps in {result.seconds:.1f} s on {result.device}, {rate:.1f} it/s")
     if result.compression > 0:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     print(f"wrote {options.output}")
-    return 130 if control.stopped else 0
+    return INTERRUPTED if result.ending == "stopped" else 0
 
 
 @contextmanager

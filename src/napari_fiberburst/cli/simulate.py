@@ -8,7 +8,7 @@ import numpy as np
 
 from napari_fiberburst.cli.arguments import parse_shape
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.simulation import MOTIONS, SCENES, simulate
 from napari_fiberburst.simulation.simulate import PHYSICS
 
@@ -38,19 +38,20 @@ def run(options: argparse.Namespace) -> int:
     """Simulate and write."""
     if options.output.suffix != ".npz":
         raise OutputError(f"a simulated burst is written with its truth to a .npz file; got {options.output}")
+    check_place(options.output)
+    simulated = simulate(
+        options.scene,
+        shape=options.shape,
+        frames=options.frames,
+        channels=options.channels,
+        motion=options.motion,
+        physics=options.physics,
+        seed=options.seed,
+        pitch=options.pitch,
+        dead_cores=options.dead_cores,
+        outline=options.outline,
+    )
     with write_whole(options.output) as stream:
-        simulated = simulate(
-            options.scene,
-            shape=options.shape,
-            frames=options.frames,
-            channels=options.channels,
-            motion=options.motion,
-            physics=options.physics,
-            seed=options.seed,
-            pitch=options.pitch,
-            dead_cores=options.dead_cores,
-            outline=options.outline,
-        )
         np.savez_compressed(stream, allow_pickle=False, **simulated.arrays())
     print(f"wrote {options.output}: {simulated.burst}")
     return 0

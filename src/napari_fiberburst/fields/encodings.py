@@ -100,7 +100,8 @@ class HashGrid(nn.Module):
         cells = ((points / _HASH_REACH + 1) / 2 * (side - 1)).clamp(0, side - 1)
         lower = cells.detach().floor().clamp(max=side - 2)
         fraction = (cells - lower)[:, None, :]
-        corners = lower.long()[:, None, :] + self.corners
+        # Once a fit has diverged, points are no numbers; their cells must still be some.
+        corners = lower.nan_to_num().long()[:, None, :] + self.corners
         weights = torch.where(self.corners.bool(), fraction, 1 - fraction).prod(dim=2)
         features = nn.functional.embedding(self._places(corners, side, len(table)), table)
         return (features * weights[:, :, None]).sum(dim=1)

@@ -3,12 +3,13 @@
 from abc import ABC, abstractmethod
 from typing import assert_never
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
 from napari_fiberburst import settings
 from napari_fiberburst.fields.layers import make_mlp, make_siren, zero_output
-from napari_fiberburst.geometry.homography import apply
+from napari_fiberburst.geometry.homography import apply, relative_to_first
 
 # A flow field is inverted to 1e-4 of half a frame: about 0.03 px of 600.
 _INVERSION_STEPS = 30
@@ -92,12 +93,14 @@ class HomographyField(MotionField):
 
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return (N, 2): M_t applied to each point. The network runs once a frame, not once a point."""
-        return apply(self.scene_from_frame()[frames], points)
+        # A look-up by embedding: its gradient sums in one order, where that of indexing is left to races of threads.
+        matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
+        return apply(matrices, points)
 
     def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return inv(M_0) M_t applied to each point."""
-        scene_from_frame = self.scene_from_frame()
-        frame0_from_frame = torch.linalg.solve(scene_from_frame[0], scene_from_frame)
+        scene_from_frame = self.scene_from_frame().detach().cpu().numpy().astype(np.float64)
+        frame0_from_frame = torch.from_numpy(relative_to_first(scene_from_frame)).to(points)
         return apply(frame0_from_frame[frames], points)
 
 

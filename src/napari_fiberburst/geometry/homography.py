@@ -31,8 +31,14 @@ def apply(target_from_source: Tensor, points: Tensor) -> Tensor:
 
 
 def relative_to_first(scene_from_frame: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return homographies (T, 3, 3) from each frame to frame 0, bottom right element 1; [0] is the identity."""
-    frame0_from_frame = np.linalg.inv(scene_from_frame[0]) @ scene_from_frame
+    """Return homographies (T, 3, 3) from each frame to frame 0, bottom right element 1; [0] is the identity.
+
+    The others are NaN where frame 0 sees the scene edge on, so that nothing can be said in its pixels.
+    """
+    try:
+        frame0_from_frame: NDArray[np.float64] = np.linalg.inv(scene_from_frame[0]) @ scene_from_frame
+    except np.linalg.LinAlgError:
+        frame0_from_frame = np.full_like(scene_from_frame, np.nan)
     frame0_from_frame[0] = np.eye(3)
-    normalised: NDArray[np.float64] = frame0_from_frame / frame0_from_frame[:, 2:, 2:]
-    return normalised
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return frame0_from_frame / frame0_from_frame[:, 2:, 2:]

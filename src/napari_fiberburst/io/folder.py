@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.recording import Recording
+from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
 
-PICTURE_ENDINGS = (".png", ".tif", ".tiff")
+PICTURE_ENDINGS = (".png", *TIFF_ENDINGS)
+# Where the bit depth stands in the header of every PNG file.
+_PNG_BIT_DEPTH = 24
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
@@ -33,14 +35,7 @@ def read_pictures(paths: list[Path], source: str) -> Recording:
         raise BurstError(f"{source} holds no frames; expected files ending in {', '.join(PICTURE_ENDINGS)}")
     frames: list[NDArray[Any]] = []
     for path in sorted(paths, key=natural_key):
-        try:
-            frame = np.squeeze(_read_picture(path))
-        except BurstError:
-            raise
-        except Exception as error:  # codecs fail on damaged files in many ways
-            raise BurstError(f"{path} cannot be read as a picture ({error}); replace it or leave it out") from error
-        if frame.ndim not in (2, 3):
-            raise BurstError(f"{path} must hold one frame, (height, width) or with channels; got shape {frame.shape}")
+        frame = _read_png(path) if path.suffix.lower() == ".png" else _read_page(path)
         if frames and (frame.shape, frame.dtype) != (frames[0].shape, frames[0].dtype):
             raise BurstError(
                 f"all frames need one size and type; {path} has {frame.shape} {frame.dtype} where those before have "
@@ -50,17 +45,28 @@ def read_pictures(paths: list[Path], source: str) -> Recording:
     return Recording(pixels=np.stack(frames), axes="TYX" if frames[0].ndim == 2 else "TYXC")
 
 
-def _read_picture(path: Path) -> NDArray[Any]:
-    if path.suffix.lower() != ".png":
-        return np.asarray(tifffile.imread(path))
-    with Image.open(path) as picture:
-        depth = path.read_bytes()[_PNG_BIT_DEPTH]
-        if depth == 16 and not picture.mode.startswith("I"):
-            raise BurstError(f"{path} has 16 bits per colour, of which only 8 could be read; save the frames as TIFF")
-        # A palette stands for colours, and an alpha channel is no light.
-        mode = {"P": "RGB", "RGBA": "RGB", "LA": "L"}.get(picture.mode, picture.mode)
-        return np.asarray(picture.convert(mode))
+def _read_page(path: Path) -> NDArray[Any]:
+    """Return the one frame of a TIFF file, (H, W) or (H, W, C)."""
+    recording = read_tiff(path)
+    axes = (recording.axes or "").replace("S", "C")
+    frame = recording.pixels
+    if "T" in axes and frame.shape[axes.index("T")] == 1:
+        frame, axes = frame.squeeze(axes.index("T")), axes.replace("T", "")
+    if axes not in ("YX", "YXC", "CYX"):
+        raise BurstError(f"{path} must hold one frame, got shape {frame.shape} with axes {axes}; open it by itself")
+    return np.moveaxis(frame, 0, 2) if axes == "CYX" else frame
 
 
-# Where the bit depth stands in the header of every PNG file.
-_PNG_BIT_DEPTH = 24
+def _read_png(path: Path) -> NDArray[Any]:
+    try:
+        with Image.open(path) as picture:
+            depth = path.read_bytes()[_PNG_BIT_DEPTH]
+            if depth == 16 and not picture.mode.startswith("I"):
+                raise BurstError(f"{path} has 16 bits per colour, of which only 8 could be read; save it as TIFF")
+            # A palette stands for colours, and an alpha channel is no light.
+            mode = {"P": "RGB", "RGBA": "RGB", "LA": "L"}.get(picture.mode, picture.mode)
+            return np.asarray(picture.convert(mode))
+    except BurstError:
+        raise
+    except Exception as error:  # Pillow fails on damaged files in many ways
+        raise BurstError(f"{path} cannot be read as a picture ({error}); replace it or leave it out") from error

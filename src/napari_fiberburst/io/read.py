@@ -2,6 +2,7 @@
 
 import glob
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,8 @@ _FORMATS = (
     "a .npz file, or OME-Zarr (.zarr)"
 )
 
+_NPZ_SCALARS = ("axes", "black_level", "white_level")
+
 
 def read_burst(
     path: str | Path,
@@ -31,8 +34,8 @@ def read_burst(
     ----------
     path : str or Path
         A multi-page TIFF or OME-TIFF; a folder of PNG or TIFF frames, or a pattern such as ``frames/*.png``, taken in
-        natural order (2 before 10); a ``.npz`` file with an array "frames", or with only one array; an OME-Zarr
-        image (needs the extra ``zarr``).
+        natural order (2 before 10); a ``.npz`` file with only one array, or with an array "frames" (and, where they
+        are known, "axes", "black_level" and "white_level"); an OME-Zarr image (needs the extra ``zarr``).
     axes : str, optional
         Order of the axes, where the file does not say it or is wrong.
     black_level, white_level : float, optional
@@ -48,32 +51,33 @@ def read_burst(
     BurstError
         There is nothing at the path, it cannot be read, or its frames are no burst.
     """
-    recording = _open(Path(path))
     try:
+        recording = _open(Path(path))
         return Burst(
             recording.pixels,
             axes=axes or recording.axes,
-            black_level=black_level,
-            white_level=white_level,
-            channel_names=recording.channel_names,
-            pixel_size=recording.pixel_size,
-            unit=recording.unit,
-            times=recording.times,
+            black_level=recording.black_level if black_level is None else black_level,
+            white_level=recording.white_level if white_level is None else white_level,
+            **recording.usable_metadata(axes),
         )
     except BurstError as error:
-        raise BurstError(f"{path}: {error}") from error
+        raise error if str(path) in str(error) else BurstError(f"{path}: {error}") from error
+    except OSError as error:
+        raise BurstError(f"{path} cannot be opened ({error}); check its name and its permissions") from error
 
 
 def _open(path: Path) -> Recording:
     if glob.has_magic(str(path)) and not path.exists():
-        return read_pictures([Path(name) for name in glob.glob(str(path))], str(path))
+        found = [Path(name) for name in glob.glob(str(path))]
+        return read_pictures(found, str(path))
     if not path.exists():
         raise BurstError(f"there is no {path}; expected {_FORMATS}")
     if path.is_dir():
         if is_zarr(path):
             return read_zarr(path)
-        found = [item for item in path.iterdir() if item.suffix.lower() in PICTURE_ENDINGS]
-        return read_pictures(found, f"the folder {path}")
+        # A dot in front hides a file: those are some system's notes on a picture, not pictures.
+        found = [item for item in path.iterdir() if item.suffix.lower() in PICTURE_ENDINGS and item.name[0] != "."]
+        return read_pictures([item for item in found if item.is_file()], f"the folder {path}")
     if path.suffix.lower() in TIFF_ENDINGS:
         return read_tiff(path)
     if path.suffix.lower() == ".npz":
@@ -88,8 +92,10 @@ def _read_npz(path: Path) -> Recording:
             if "frames" not in names and len(names) != 1:
                 raise BurstError(f"{path} needs an array named 'frames'; it has {', '.join(names) or 'none'}")
             name = "frames" if "frames" in names else names[0]
-            axes = str(arrays["axes"]) if "axes" in names else None
-            return Recording(pixels=arrays[name], axes=axes)
+            known: dict[str, Any] = {key: arrays[key].item() for key in _NPZ_SCALARS if key in names}
+            if not isinstance(known.get("axes", ""), str):
+                raise BurstError(f'{path} must give its axes as text, such as "CTYX"; got {known["axes"]!r}')
+            return Recording(pixels=arrays[name], **known)
     except BurstError:
         raise
     except Exception as error:  # a damaged archive fails in zipfile, zlib or numpy, each in its own way

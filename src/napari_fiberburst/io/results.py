@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from secrets import token_hex
 from typing import IO, Any
 
 import numpy as np
@@ -21,23 +22,47 @@ from napari_fiberburst.errors import OutputError
 
 PICTURE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 REPRESENTATION_ENDING = ".npz"
-_NAMED_PACKAGES = ("napari-fiberburst", "numpy", "scipy", "torch", "scikit-image", "tifffile")
+# Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
+_OME_UNITS = ("pm", "Å", "nm", "µm", "mm", "cm", "m", "in", "pixel")
+_SOFTWARE = "napari-fiberburst"
+_NAMED_PACKAGES = (_SOFTWARE, "numpy", "scipy", "torch", "scikit-image", "tifffile")
 
 
-def check_output(path: str | Path) -> Path:
-    """Refuse a path that a result could not be written to; before a long run rather than after it.
+def check_output(path: str | Path, source: Path | None = None) -> Path:
+    """Refuse a path that a result should not be written to; before a long run rather than after it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Where to write.
+    source : Path, optional
+        What the result is made from, which it must not replace.
 
     Raises
     ------
     OutputError
-        Its ending is unknown, or its folder does not exist or cannot be written.
+        The ending is unknown; the folder does not exist or cannot be written; the file, or the JSON beside it, is
+        the source or no result of ours.
     """
     target = Path(path)
     endings = (*PICTURE_ENDINGS, REPRESENTATION_ENDING)
     if not target.name.lower().endswith(endings):
         raise OutputError(f"a result is written to a file ending in {', '.join(endings)}; got {target}")
-    _check_folder(target)
+    files = [target] if is_representation(target) else [target, sidecar_of(target)]
+    for file in files:
+        check_place(file)
+        if source is not None and file.exists() and source.exists() and file.samefile(source):
+            raise OutputError(f"{file} is what the result is made from, and would be lost; choose another name")
+    if len(files) == 2 and files[1].exists() and not _is_ours(files[1]):
+        raise OutputError(
+            f"{files[1]} is not of napari-fiberburst, and would be lost; choose another name for {target}"
+        )
     return target
+
+
+def is_representation(path: Path) -> bool:
+    """Whether a path names the fitted networks rather than a picture."""
+    return path.name.lower().endswith(REPRESENTATION_ENDING)
 
 
 def sidecar_of(path: Path) -> Path:
@@ -53,9 +78,9 @@ def write_picture(
     """Write an image as OME-TIFF with pixel size and channel names, and its provenance as JSON beside it."""
     target = check_output(path)
     metadata: dict[str, Any] = {"axes": "YX" if image.ndim == 2 else "YXC"}
-    if acquisition.pixel_size is not None:
+    unit = acquisition.unit or "µm"
+    if acquisition.pixel_size is not None and unit in _OME_UNITS:
         height, width = acquisition.pixel_size
-        unit = acquisition.unit or "µm"
         metadata |= {"PhysicalSizeY": height, "PhysicalSizeYUnit": unit}
         metadata |= {"PhysicalSizeX": width, "PhysicalSizeXUnit": unit}
     if image.ndim == 3:
@@ -63,10 +88,9 @@ def write_picture(
         if acquisition.channel_names:
             metadata["Channel"] = {"Name": list(acquisition.channel_names)}
     document = json.dumps({**_versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
-    with write_whole(target) as stream:
-        tifffile.imwrite(stream, image, ome=True, photometric="minisblack", metadata=metadata)
-    with write_whole(sidecar_of(target)) as stream:
-        stream.write(document.encode())
+    with write_whole(target) as picture, write_whole(sidecar_of(target)) as sidecar:
+        tifffile.imwrite(picture, image, ome=True, photometric="minisblack", metadata=metadata)
+        sidecar.write(document.encode())
     return target
 
 
@@ -107,8 +131,8 @@ def write_whole(path: Path) -> Iterator[IO[bytes]]:
     OutputError
         The folder does not exist or cannot be written.
     """
-    _check_folder(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    check_place(path)
+    partial = path.with_name(f".{token_hex(8)}.part")
     try:
         with partial.open("wb") as stream:
             yield stream
@@ -121,13 +145,31 @@ def write_whole(path: Path) -> Iterator[IO[bytes]]:
         partial.unlink(missing_ok=True)
 
 
-def _check_folder(path: Path) -> None:
-    if not path.parent.is_dir():
-        raise OutputError(f"the folder {path.parent} does not exist; make it first, or choose another")
-    if path.is_dir():
-        raise OutputError(f"{path} is a folder; name a file in it")
-    if not os.access(path.parent, os.W_OK):
-        raise OutputError(f"the folder {path.parent} cannot be written; choose another")
+def check_place(path: Path) -> None:
+    """Refuse a path that no file can be written to.
+
+    Raises
+    ------
+    OutputError
+        Its folder does not exist or cannot be written, or the path is a folder.
+    """
+    try:
+        if not path.parent.is_dir():
+            raise OutputError(f"the folder {path.parent} does not exist; make it first, or choose another")
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"the folder {path.parent} cannot be written; choose another")
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder; name a file in it")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written ({error}); choose another place") from error
+
+
+def _is_ours(path: Path) -> bool:
+    try:
+        told = json.loads(path.read_bytes())
+    except ValueError:
+        return False
+    return isinstance(told, dict) and told.get("software") == _SOFTWARE
 
 
 def _versions() -> dict[str, Any]:
@@ -137,7 +179,7 @@ def _versions() -> dict[str, Any]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return {"software": "napari-fiberburst", "versions": found}
+    return {"software": _SOFTWARE, "versions": found}
 
 
 def _plain(value: Any) -> Any:

@@ -1,46 +1,54 @@
 """TIFF stacks, with what OME and ImageJ metadata say of axes, pixel size, channels and times."""
 
+import logging
 import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tifffile
+from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.io.recording import Recording
+from napari_fiberburst.io.recording import Recording, with_time
+
+logger = logging.getLogger(__name__)
 
 TIFF_ENDINGS = (".tif", ".tiff")
-# What tifffile calls the axis of pages where the file does not name one; a burst has no depth.
-_PAGE_AXES = "QIZ"
+_SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 def read_tiff(path: Path) -> Recording:
-    """Read the first series of a TIFF file.
+    """Read the frames of a TIFF file: its first series, or all its pages where each is a series of its own.
 
     Raises
     ------
     BurstError
-        The file is empty, cut short, or no TIFF.
+        The file is empty, cut short, of pages of different sizes, or no TIFF.
     """
     if path.stat().st_size == 0:
         raise BurstError(f"{path} is empty; copy or export it again")
     try:
         with tifffile.TiffFile(path) as file:
             if _is_cut_short(file):
-                raise BurstError(f"{path} is cut short: its last frames are missing; copy or export it again")
-            series = file.series[0]
-            described = _from_ome(file) or _from_imagej(file)
-            return Recording(pixels=series.asarray(), axes=_with_time(series.axes), **described)
+                raise BurstError(f"{path} is cut short, or parts of it are missing; copy or export it again")
+            pixels, axes = _light(*_frames(file, path), file.series[0].keyframe)
+            axes = with_time(axes)
+            count = pixels.shape[axes.index("T")] if "T" in axes else 1
+            return Recording(pixels=pixels, axes=axes, **_described(file, count))
     except BurstError:
         raise
     except Exception as error:  # tifffile and its codecs fail on damaged files in many ways
-        raise BurstError(f"{path} cannot be read as TIFF ({error}); copy or export it again") from error
+        advice = "copy or export it again"
+        if "imagecodecs" in str(error):
+            advice = "install it by: pip install imagecodecs, or save the file without compression"
+        raise BurstError(f"{path} cannot be read as TIFF ({error}); {advice}") from error
 
 
 def _is_cut_short(file: tifffile.TiffFile) -> bool:
-    """Whether the last page that could be read points to a further one beyond the end of the file.
+    """Whether pages or pixels that the file points to are not in it.
 
-    tifffile only logs this, and reads what is left as if it were the whole.
+    tifffile logs this at most, and reads what is left as if it were the whole.
     """
     handle, layout = file.filehandle, file.tiff
     last = file.pages[len(file.pages) - 1].offset
@@ -48,43 +56,75 @@ def _is_cut_short(file: tifffile.TiffFile) -> bool:
     (tags,) = struct.unpack(layout.tagnoformat, handle.read(layout.tagnosize))
     handle.seek(last + layout.tagnosize + tags * layout.tagsize)
     (following,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
-    return bool(following >= handle.size)
+    if following != 0:  # a further page, of which nothing could be read
+        return True
+    pages = [page for series in file.series for page in series.pages]
+    return any(page is None or _end_of(page) > page.parent.filehandle.size for page in pages)
 
 
-def _with_time(axes: str) -> str:
-    if "T" not in axes:
-        for page_axis in _PAGE_AXES:
-            if page_axis in axes:
-                return axes.replace(page_axis, "T")
-    return axes
+def _end_of(page: Any) -> int:
+    return max((start + length for start, length in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
 
 
-def _from_ome(file: tifffile.TiffFile) -> dict[str, Any]:
-    if not file.is_ome or not file.ome_metadata:
+def _frames(file: tifffile.TiffFile, path: Path) -> tuple[NDArray[Any], str]:
+    first, *others = file.series
+    if not others or file.is_ome:  # an OME file may hold further images, of which the first is the one
+        return first.asarray(), first.axes
+    if any((series.shape, series.dtype, series.axes) != (first.shape, first.dtype, first.axes) for series in others):
+        shapes = ", ".join(dict.fromkeys(str(series.shape) for series in file.series))
+        raise BurstError(f"{path} holds pages of different sizes or types, {shapes}; keep the frames of one size")
+    return np.stack([series.asarray() for series in file.series]), "T" + first.axes
+
+
+def _light(pixels: NDArray[Any], axes: str, page: Any) -> tuple[NDArray[Any], str]:
+    """Return colours for the indices of a palette, and leave out alpha channels, which are no light."""
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE and page.colormap is not None:
+        return np.moveaxis(page.colormap[:, pixels], 0, -1), axes + "S"
+    alphas = sum(sample in (1, 2) for sample in page.extrasamples)
+    if alphas and "S" in axes:
+        samples = axes.index("S")
+        pixels = np.delete(pixels, range(pixels.shape[samples] - alphas, pixels.shape[samples]), axis=samples)
+        if pixels.shape[samples] == 1:
+            pixels, axes = pixels.squeeze(samples), axes.replace("S", "")
+    return pixels, axes
+
+
+def _described(file: tifffile.TiffFile, count: int) -> dict[str, Any]:
+    """Return what is said of `count` frames; nothing where what is said makes no sense."""
+    try:
+        if file.is_ome and file.ome_metadata:
+            return _from_ome(file.ome_metadata, count)
+        return _from_imagej(file, count)
+    except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
+        logger.warning("ignoring the metadata of %s, which cannot be read: %r", file.filename, error)
         return {}
-    image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+
+
+def _from_ome(document: str, count: int) -> dict[str, Any]:
+    image = tifffile.xml2dict(document)["OME"]["Image"]
     pixels = (image[0] if isinstance(image, list) else image)["Pixels"]
     described: dict[str, Any] = {}
     if "PhysicalSizeX" in pixels and "PhysicalSizeY" in pixels:
         described["pixel_size"] = (float(pixels["PhysicalSizeY"]), float(pixels["PhysicalSizeX"]))
         described["unit"] = pixels.get("PhysicalSizeXUnit", "µm")
-    channels = _as_list(pixels.get("Channel"))
-    names = tuple(str(channel["Name"]) for channel in channels if "Name" in channel)
-    if names and len(names) == int(pixels["SizeC"]):
-        described["channel_names"] = names
-    count = int(pixels["SizeT"])
-    deltas = {plane["TheT"]: float(plane["DeltaT"]) for plane in _as_list(pixels.get("Plane")) if "DeltaT" in plane}
+    names = [channel.get("Name") for channel in _as_list(pixels.get("Channel"))]
+    if names and None not in names:
+        described["channel_names"] = tuple(str(name) for name in names)
+    planes = [plane for plane in _as_list(pixels.get("Plane")) if "DeltaT" in plane]
+    deltas = {(plane["TheT"], plane["TheZ"]): _seconds(plane, "DeltaT") for plane in reversed(planes)}
     if len(deltas) == count:
-        described["times"] = [deltas[index] for index in range(count)]
+        described["times"] = [deltas[place] for place in sorted(deltas)]
     elif "TimeIncrement" in pixels:
-        described["times"] = [index * float(pixels["TimeIncrement"]) for index in range(count)]
+        described["times"] = [index * _seconds(pixels, "TimeIncrement") for index in range(count)]
     return described
 
 
-def _from_imagej(file: tifffile.TiffFile) -> dict[str, Any]:
-    known = file.imagej_metadata
-    if not known:
-        return {}
+def _seconds(element: dict[str, Any], name: str) -> float:
+    return float(element[name]) * _SECONDS[element.get(name + "Unit", "s")]
+
+
+def _from_imagej(file: tifffile.TiffFile, count: int) -> dict[str, Any]:
+    known = file.imagej_metadata or {}
     described: dict[str, Any] = {}
     tags = file.pages.first.tags
     if known.get("unit") and "XResolution" in tags and "YResolution" in tags:
@@ -93,7 +133,7 @@ def _from_imagej(file: tifffile.TiffFile) -> dict[str, Any]:
         # ImageJ escapes the micro sign.
         described["unit"] = str(known["unit"]).replace("\\u00B5", "µ")
     if known.get("finterval"):
-        described["times"] = [index * float(known["finterval"]) for index in range(int(known.get("frames", 1)))]
+        described["times"] = [index * float(known["finterval"]) for index in range(count)]
     return described
 
 

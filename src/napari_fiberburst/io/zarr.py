@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.io.recording import Recording
+from napari_fiberburst.io.recording import Recording, with_time
 
 _MARKERS = ("zarr.json", ".zgroup", ".zattrs", ".zarray")
 
@@ -53,7 +53,7 @@ def _describe(pixels: Any, axes: list[dict[str, str]], level: dict[str, Any], om
     seconds = t >= 0 and axes[t].get("unit") == "second"
     return Recording(
         pixels=pixels,
-        axes=names,
+        axes=with_time(names),
         channel_names=tuple(channel.get("label", "") for channel in omero.get("channels", [])),
         pixel_size=(scale[y], scale[x]) if scale and "unit" in axes[y] else None,
         unit=axes[y].get("unit"),

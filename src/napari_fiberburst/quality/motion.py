@@ -12,7 +12,8 @@ def motion_error(homographies: NDArray[np.floating], truth: NDArray[np.floating]
     """Return how far the frames' pixels land from the truth, modulo one homography of the whole scene.
 
     The data say how frames lie to one another, not where the scene as a whole lies: a homography common to all
-    frames (the gauge) can be undone by warping the scene. It is fitted and removed before positions are compared.
+    frames (the gauge) can be undone by warping the scene. It is fitted and removed before positions are compared,
+    and with it the error that homographies relative to frame 0 share because frame 0's own is off.
 
     Parameters
     ----------

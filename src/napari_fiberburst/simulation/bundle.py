@@ -120,9 +120,12 @@ def make_bundle(
         ("pitch", pitch, 2.0, min(shape) / 4),
         ("core_radius", core_radius, 0.05, 0.7),
         ("dead_cores", dead_cores, 0.0, 0.9),
+        ("radius_spread", radius_spread, 0.0, 0.5),
+        ("jitter", jitter, 0.0, 0.5),
+        ("gain_spread", gain_spread, 0.0, 0.4),
         ("crosstalk", crosstalk, 0.0, 1.0),
     ):
-        if not least <= value <= most:
+        if isinstance(value, str) or not least <= value <= most:
             raise SettingsError(f"{name} must be from {least:g} to {most:g}; got {value!r}")
     if outline not in ("frame", "circle"):
         raise SettingsError(f"unknown outline {outline!r}; known: frame, circle")
@@ -133,7 +136,8 @@ def make_bundle(
     if outline == "circle":
         inside = np.hypot(*(centres - middle).T) <= min(shape) / 2 - pitch
     else:
-        inside = (np.abs(centres - middle) <= middle + pitch).all(axis=1)
+        # Of a core whose centre is farther out, too little shows to say what light falls on it.
+        inside = (np.abs(centres - middle) <= middle + 0.5 + 0.25 * core_radius * pitch).all(axis=1)
     centres = centres[inside]
     count = len(centres)
     radii = core_radius * pitch * np.clip(rng.normal(1, radius_spread, count), 0.5, 1.5)

@@ -35,18 +35,31 @@ class Camera:
     bits: int = 8
 
     def __post_init__(self) -> None:
-        if not 8 <= self.bits <= 16 or self.photons <= 0 or self.read_noise < 0 or not 0 <= self.pedestal < 1:
+        possible = (
+            isinstance(self.bits, int)
+            and 8 <= self.bits <= 16
+            and self.photons > 0
+            and 0 <= self.read_noise < 1
+            and 0 < self.exposure < float("inf")
+            and 0 <= self.pedestal < 1
+        )
+        if not possible:
             raise SettingsError(
-                "a camera has 8 to 16 bits, photons above 0, read_noise of at least 0 and a pedestal in [0, 1); "
+                "a camera has 8 to 16 bits, photons and exposure above 0, and read_noise and pedestal in [0, 1); "
                 f"got {self}"
             )
+
+    @property
+    def full_scale(self) -> int:
+        """The largest number it gives."""
+        return int(2**self.bits) - 1
 
     def record(self, light: NDArray[np.float32], rng: Generator) -> NDArray[Any]:
         """Turn light, 1 at full scale, into the camera's numbers; shot noise is Gaussian, as for many photons."""
         signal = light * np.float32(self.exposure)
         noise = rng.standard_normal(signal.shape, dtype=np.float32)
         noise *= np.sqrt(signal / np.float32(self.photons) + np.float32(self.read_noise**2))
-        full = 2**self.bits - 1
+        full = self.full_scale
         signal += noise
         signal *= np.float32(full * (1 - self.pedestal))
         signal += np.float32(full * self.pedestal)

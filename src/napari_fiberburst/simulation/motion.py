@@ -149,4 +149,4 @@ MOTIONS: Mapping[str, Callable[..., NDArray[np.float64]]] = {
 
 def _turn_back(path: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
     """Fold a path at +- reach, as a ball between two walls."""
-    return np.abs((path + reach) % (4 * reach) - 2 * reach) - reach if reach > 0 else 0 * path
+    return reach - np.abs((path + reach) % (4 * reach) - 2 * reach) if reach > 0 else 0 * path

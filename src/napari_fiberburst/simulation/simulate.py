@@ -1,6 +1,7 @@
 """Simulated bursts with ground truth."""
 
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from napari_fiberburst.simulation.motion import MOTIONS
 from napari_fiberburst.simulation.scenes import Scene, make_scene
 
 PHYSICS = ("mask", "core")
+_BUNDLE_SETTINGS = [item.name for item in signature(make_bundle).parameters.values() if item.kind is item.KEYWORD_ONLY]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +52,7 @@ class SimulatedBurst:
         return {
             "frames": frames,
             "axes": np.array("TYXC"),
+            "white_level": np.array(self.burst.white_level),
             "truth": self.truth,
             "homographies": self.homographies,
             "transmission": self.transmission,
@@ -104,19 +107,17 @@ def simulate(
     """
     if physics not in PHYSICS:
         raise SettingsError(f"unknown physics {physics!r}; known: {', '.join(PHYSICS)}")
-    if frames < MIN_FRAMES or min(shape) < MIN_SIDE:
-        raise SettingsError(
-            f"a burst has at least {MIN_FRAMES} frames of at least {MIN_SIDE} pixels a side; got {frames} of {shape}"
-        )
+    _check_numbers(shape, frames, channels, seed)
+    unknown = sorted(set(bundle) - set(_BUNDLE_SETTINGS))
+    if unknown:
+        raise SettingsError(f"unknown setting {unknown[0]!r}; known of the bundle: {', '.join(_BUNDLE_SETTINGS)}")
+    camera = camera or Camera()
     # One generator for each part, so that a change of one leaves the others as they were.
     scene_rng, motion_rng, bundle_rng, camera_rng = np.random.default_rng(seed).spawn(4)
     seen = scene if isinstance(scene, Scene) else make_scene(scene, shape, scene_rng)
-    seen = seen.with_channels(channels or seen.channels)
+    seen = seen.with_channels(seen.channels if channels is None else channels)
     homographies = _motion(motion, frames, shape, motion_rng)
-    try:
-        cores = make_bundle(shape, bundle_rng, **bundle)
-    except TypeError as error:
-        raise SettingsError(f"unknown setting of the bundle: {error}; see make_bundle for those there are") from error
+    cores = make_bundle(shape, bundle_rng, **bundle)
     rows, columns = np.indices(shape, dtype=np.float64)
     pixels = np.stack([columns, rows], axis=-1)
     truth = np.stack([seen.sample(_apply(matrix, pixels)) for matrix in homographies])
@@ -125,10 +126,11 @@ def simulate(
         light = truth * transmission.astype(np.float32)[..., None]
     else:
         light = _through_cores(truth, cores)
-    recorded = (camera or Camera()).record(light, camera_rng)
+    recorded = camera.record(light, camera_rng)
     grey = seen.channels == 1
+    pixels, axes = (recorded[..., 0], "TYX") if grey else (recorded, "TYXC")
     return SimulatedBurst(
-        burst=Burst(recorded[..., 0] if grey else recorded, axes="TYX" if grey else "TYXC"),
+        burst=Burst(pixels, axes=axes, black_level=0, white_level=camera.full_scale),
         truth=truth,
         homographies=homographies,
         transmission=transmission,
@@ -167,8 +169,17 @@ def _motion(
             raise SettingsError(f"unknown motion {motion!r}; known: {', '.join(MOTIONS)}, or homographies (T, 3, 3)")
         return MOTIONS[motion](frames, shape, rng)
     homographies = np.array(motion, dtype=np.float64)
-    if homographies.shape != (frames, 3, 3) or not np.allclose(homographies[0], np.eye(3)):
-        raise SettingsError(
-            f"homographies must have shape {(frames, 3, 3)} and begin with the identity; got {homographies.shape}"
-        )
+    if homographies.shape != (frames, 3, 3):
+        raise SettingsError(f"homographies must have shape {(frames, 3, 3)}; got {homographies.shape}")
+    if not np.allclose(homographies[0], np.eye(3)) or not (np.abs(np.linalg.det(homographies)) > 1e-12).all():
+        raise SettingsError("homographies must begin with the identity, and each must have an inverse")
     return homographies
+
+
+def _check_numbers(shape: tuple[int, int], frames: int, channels: int | None, seed: int) -> None:
+    wanted = {"frames": (frames, MIN_FRAMES), "channels": (1 if channels is None else channels, 1), "seed": (seed, 0)}
+    if len(shape) != 2:
+        raise SettingsError(f"shape must be (height, width); got {shape}")
+    for name, (value, least) in {**wanted, "height": (shape[0], MIN_SIDE), "width": (shape[1], MIN_SIDE)}.items():
+        if not isinstance(value, int | np.integer) or value < least:
+            raise SettingsError(f"{name} must be an integer of at least {least}; got {value!r}")

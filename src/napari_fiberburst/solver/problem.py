@@ -18,7 +18,10 @@ from napari_fiberburst.solver.samples import Samples
 BATCHES_PER_FRAME = 8
 BETAS = (0.9, 0.999)
 
-_State = tuple[dict[str, Any], dict[str, Any], int]
+# What two bursts must share to be taken for one.
+_IDENTITY = ("shape", "axes", "dtype", "black_level", "white_level", "origin")
+# Of the field, of Adam, and how many samples were drawn.
+State = tuple[dict[str, Any], dict[str, Any], int]
 
 
 class Problem:
@@ -41,6 +44,8 @@ class Problem:
         `initial` stands for another burst or was made with other networks.
     """
 
+    # Whatever the caller's thread has set, the fit needs gradients, and tensors that can have them.
+    @torch.inference_mode(False)
     def __init__(
         self, burst: Burst, settings: Settings, device: torch.device, initial: Reconstruction | None = None
     ) -> None:
@@ -52,13 +57,12 @@ class Problem:
         self.samples = Samples(burst, device, settings.seed)
         if initial is not None:
             self._go_on_from(initial, burst, settings)
-        self._kept: tuple[_State, ...] = ()
-        self.keep()
 
+    @torch.inference_mode(False)
     def step(self) -> Tensor:
         """Take one step of Adam on a fresh batch; return the loss before it, still on the device."""
         batch = self.samples.draw(self.batch)
-        with torch.enable_grad():  # whatever the caller's thread has set
+        with torch.enable_grad():
             predicted = self.field(batch.points, batch.frames)
             loss: Tensor = (predicted - batch.intensities).square().mean()
             roughness = self.field.motion.roughness(batch.points, batch.frames)
@@ -76,19 +80,18 @@ class Problem:
 
     def is_finite(self) -> bool:
         """Whether every parameter is a number. Waits for the device."""
-        return all(bool(torch.isfinite(parameter).all()) for parameter in self.field.parameters())
+        sums = torch.stack([parameter.detach().sum() for parameter in self.field.parameters()])
+        return bool(torch.isfinite(sums).all())
 
-    def keep(self) -> None:
-        """Remember this state, and the one that was remembered before it.
+    @torch.inference_mode(False)
+    def state(self) -> State:
+        """Return a copy of all that a step changes."""
+        return deepcopy((self.field.state_dict(), self.optimizer.state_dict(), self.samples.drawn))
 
-        A state proves good only by the loss of the step after it, so the newest may turn out to be bad.
-        """
-        state = deepcopy((self.field.state_dict(), self.optimizer.state_dict(), self.samples.drawn))
-        self._kept = (*self._kept[-1:], state)
-
-    def restore(self, *, newest: bool) -> None:
-        """Return to the state remembered last, or to the one before."""
-        field, optimizer, drawn = self._kept[-1 if newest else 0]
+    @torch.inference_mode(False)
+    def restore(self, state: State) -> None:
+        """Return to a state."""
+        field, optimizer, drawn = state
         self.field.load_state_dict(field)
         self.optimizer.load_state_dict(optimizer)
         self.samples.drawn = drawn
@@ -100,11 +103,9 @@ class Problem:
 
     def _go_on_from(self, initial: Reconstruction, burst: Burst, settings: Settings) -> None:
         start = initial.renderer
-        if not isinstance(start, Representation) or initial.acquisition.shape != burst.shape:
-            raise SettingsError(
-                f"initial must be a reconstruction of this burst, shape {burst.shape}; it was made from one of shape "
-                f"{initial.acquisition.shape}"
-            )
+        here, there = ({name: getattr(of, name) for name in _IDENTITY} for of in (burst, initial.acquisition))
+        if not isinstance(start, Representation) or here != there:
+            raise SettingsError(f"initial must be a reconstruction of this burst, {here}; it was made from {there}")
         try:
             self.field.load_state_dict(start.field.state_dict())
         except RuntimeError as error:

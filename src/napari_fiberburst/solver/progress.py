@@ -19,11 +19,13 @@ class Progress:
     loss : float
         Latest mean squared error over the step's samples, intensities in [-1, 1], and the motion's prior if any.
     seconds : float
-        Time spent in this run, pauses left out.
+        Time since the run began its steps, pauses left out.
     rate : float
         Steps per second since the run's first step ended; 0 until the second step.
     homographies : numpy.ndarray
         (T, 3, 3) float64, frame-t pixel to frame-0 pixel, as of now.
+    remaining : float or None
+        Seconds until the run ends, by its steps or its time budget; None while neither is known, 0 at the end.
     preview : numpy.ndarray or None
         The picture as of now, in the burst's intensity units, (H, W) or (H, W, C) float32; None where this
         report has none.
@@ -34,10 +36,6 @@ class Progress:
     loss: float
     seconds: float
     rate: float
+    remaining: float | None
     homographies: NDArray[np.float64]
     preview: NDArray[np.float32] | None = None
-
-    @property
-    def remaining(self) -> float | None:
-        """Seconds until the run ends at this rate; None while the rate is unknown."""
-        return (self.iterations - self.step) / self.rate if self.rate > 0 else None

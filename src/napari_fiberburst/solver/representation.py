@@ -15,12 +15,13 @@ from napari_fiberburst.fields import JointField
 from napari_fiberburst.geometry.coordinates import in_pixels, unit_from_pixel
 from napari_fiberburst.geometry.homography import relative_to_first
 from napari_fiberburst.io.results import read_representation
-from napari_fiberburst.reconstruction import Canvas, Reconstruction
+from napari_fiberburst.reconstruction import Canvas, Reconstruction, draw
 from napari_fiberburst.settings import Settings
 from napari_fiberburst.solver.device import find_device
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
 _CHUNK = 16_384
+_DRAWN = "samples_drawn"
 
 
 class Representation:
@@ -77,8 +78,9 @@ class Representation:
         return relative_to_first(in_pixels(scene_from_frame, self.frame_shape))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the fitted parameters and the random frequencies by name."""
-        return {name: value.cpu().numpy() for name, value in self.field.state_dict().items()}
+        """Return the fitted parameters, the random frequencies and the samples drawn, by name."""
+        parameters = {name: value.cpu().numpy() for name, value in self.field.state_dict().items()}
+        return {**parameters, _DRAWN: np.array(self.drawn)}
 
     def _by_chunks(
         self, function: Callable[[Tensor, Tensor], Tensor], points: NDArray[np.float64], frame: int
@@ -120,24 +122,29 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
     place = find_device(device)
     arrays, provenance = read_representation(path)
     try:
-        settings = Settings.from_dict(provenance["settings"])
-        acquisition = Acquisition.from_dict(provenance["burst"])
-        count, height, width, channels = acquisition.shape
-        field = JointField(settings, count, channels)
-        field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    except (FiberBurstError, KeyError, TypeError, RuntimeError) as error:
-        raise OutputError(f"{path} is no reconstruction that this version can read: {error}") from error
-    representation = Representation(field.to(place), (height, width))
+        return _rebuild(arrays, provenance, place)
+    except (FiberBurstError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise OutputError(f"{path} is no reconstruction that this version can read: {error!r}") from error
+
+
+def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
+    settings = Settings.from_dict(provenance["settings"])
+    acquisition = Acquisition.from_dict(provenance["burst"])
+    count, height, width, channels = acquisition.shape
+    drawn = int(arrays.pop(_DRAWN))
+    field = JointField(settings, count, channels)
+    field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    representation = Representation(field.to(device), (height, width), drawn=drawn)
     canvas = Canvas.over((0, 0, width, height))
     return Reconstruction(
-        image=acquisition.in_original_units(representation.render(canvas.points(), 0)),
+        image=draw(representation, canvas, 0, acquisition),
         canvas=canvas,
         homographies=representation.homographies(),
         losses=np.array(provenance["losses"], dtype=np.float32),
         settings=settings,
-        seconds=provenance["seconds"],
+        seconds=float(provenance["seconds"]),
         parameters=field.parameter_count,
-        device=str(place),
+        device=str(device),
         ending=provenance["ending"],
         acquisition=acquisition,
         renderer=representation,

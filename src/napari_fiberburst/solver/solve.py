@@ -1,29 +1,21 @@
 """`iterate`, a generator of progress reports, and `reconstruct`, which drains it."""
 
-import logging
-import time
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from napari_fiberburst.burst import Burst
 from napari_fiberburst.control import Control
+from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
-from napari_fiberburst.reconstruction import Canvas, Ending, Reconstruction
-from napari_fiberburst.settings import Encoding, Fourier, Motion, Settings, choose
+from napari_fiberburst.reconstruction import Reconstruction
+from napari_fiberburst.settings import Encoding, Motion, Settings, choose
 from napari_fiberburst.solver.device import find_device
-from napari_fiberburst.solver.problem import Problem
 from napari_fiberburst.solver.progress import Progress
-
-logger = logging.getLogger(__name__)
-
-# Reports make the host wait for the device, so there are few of them, and more would not be seen.
-_SECONDS_BETWEEN_REPORTS = 0.1
+from napari_fiberburst.solver.run import Run
 
 
 def reconstruct(
@@ -66,12 +58,14 @@ def reconstruct(
     on_progress : callable, optional
         Called with a `Progress` some ten times a second at most, in this thread.
     should_stop : callable, optional
-        Asked before every step; where it returns True the run ends with what it has.
+        Asked before every step, and while paused; where it returns True the run ends with what it has.
     control : Control, optional
         To stop, pause and resume the run from another thread, and change its sigma and learning rate.
     initial : Reconstruction, optional
-        Continue from this reconstruction of the same burst for `iterations` more steps. Its settings take the
-        preset's place.
+        Continue from this reconstruction of the same burst for `iterations` more steps. Its settings, the seed
+        among them, take the preset's place, but for its time budget and previews. In one process the run goes on
+        exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
+        Adam's moments start anew.
     **more
         Any other field of `Settings`, or of the motion or the encoding chosen, by name: ``time_budget=10.0``,
         ``learning_rate=1e-3``, ``features=128``.
@@ -98,8 +92,11 @@ def reconstruct(
     >>> result.image.shape
     (32, 40, 3)
     """
+    settings = choose(preset)
+    if initial is not None:
+        settings, seed = _continued(initial, seed)
     settings = choose(
-        preset if initial is None else initial.settings,
+        settings,
         motion=motion,
         encoding=encoding,
         sigma=sigma,
@@ -108,6 +105,9 @@ def reconstruct(
         seed=seed,
         **more,
     )
+    for name, called in (("on_progress", on_progress), ("should_stop", should_stop)):
+        if called is not None and not callable(called):
+            raise SettingsError(f"{name} must be a function; got {called!r}")
     find_device(settings.device)  # before a long read
     burst = as_burst(frames)
     run = iterate(burst, settings, control=control, should_stop=should_stop, initial=initial)
@@ -143,14 +143,16 @@ def iterate(
     Parameters
     ----------
     burst, settings
-        What to fit, and how.
+        What to fit, and how. A time budget runs from the first step on, while reports are taken too, and leaves
+        time for at least one step.
     control, should_stop, initial
         As in `reconstruct`.
 
     Yields
     ------
     Progress
-        After the first step, then at most ten times a second, and after the last step.
+        After the first step, then at most ten times a second, and at the end, however it came, with a preview
+        where previews are asked for. None where the run was stopped before its first step.
 
     Returns
     -------
@@ -164,14 +166,16 @@ def iterate(
     DeviceError
         The device is not on this machine.
     """
-    control = control or Control()
-    run = _Run(burst, settings, initial)
+    control = Control() if control is None else control
+    if not isinstance(control, Control):
+        raise SettingsError(f"control must be a napari_fiberburst.Control; got {control!r}")
+    run = Run(burst, settings, initial)
     while run.step < settings.iterations:
-        run.hold_while_paused(control)
+        run.hold_while_paused(control, should_stop)
         if control.stopped or (should_stop is not None and should_stop()):
             run.ending = "stopped"
             break
-        if settings.time_budget is not None and run.seconds >= settings.time_budget:
+        if run.is_out_of_time():
             run.ending = "time budget"
             break
         run.follow(control)
@@ -180,134 +184,21 @@ def iterate(
             if not run.is_healthy():
                 break
             yield run.report()
-    return run.finish()
+    run.finish()
+    if run.step > 0:
+        yield run.report(last=True)
+    return run.result()
 
 
-class _Run:
-    """The bookkeeping of one run: its clock, losses and reports."""
-
-    def __init__(self, burst: Burst, settings: Settings, initial: Reconstruction | None) -> None:
-        self._started = time.perf_counter()
-        self._burst = burst
-        self._settings = settings
-        self._initial = initial
-        self._device = find_device(settings.device)
-        self._problem = Problem(burst, settings, self._device, initial)
-        self._losses = torch.zeros(settings.iterations, device=self._device)
-        self._looked: tuple[int, ...] = (0,)
-        self._sigma: float | None = None
-        self._first_done: float | None = None
-        self._reported = self._previewed = 0.0
-        self.step = 0
-        self.ending: Ending = "finished"
-
-    @property
-    def seconds(self) -> float:
-        """Time spent, pauses left out."""
-        return time.perf_counter() - self._started
-
-    def hold_while_paused(self, control: Control) -> None:
-        paused_at = time.perf_counter()
-        control.wait_while_paused()
-        self._started += time.perf_counter() - paused_at
-
-    def follow(self, control: Control) -> None:
-        """Take over what a user has changed since the last step."""
-        rate, sigma = control.learning_rate, control.sigma
-        if rate is not None and rate != self._settings.learning_rate:
-            self._problem.set_learning_rate(rate)
-            self._settings = replace(self._settings, learning_rate=rate)
-        encoding = self._settings.encoding
-        if sigma is None or sigma == self._sigma:
-            return
-        self._sigma = sigma
-        if isinstance(encoding, Fourier):
-            self._problem.field.scene.set_sigma(sigma)
-            self._settings = replace(self._settings, encoding=replace(encoding, sigma=sigma))
-        else:
-            logger.warning("sigma %g has no effect: encoding %s has no frequency spread", sigma, encoding.name)
-
-    def advance(self) -> None:
-        self._losses[self.step] = self._problem.step()
-        self.step += 1
-        if self._first_done is None:
-            self._first_done = self.seconds
-
-    def is_report_due(self) -> bool:
-        due = self.seconds - self._reported >= _SECONDS_BETWEEN_REPORTS
-        return due or self.step in (1, self._settings.iterations)
-
-    def is_healthy(self) -> bool:
-        """Whether all losses since the last look, and all parameters, are numbers; else go back to when they were."""
-        finite = torch.isfinite(self._losses[self._looked[-1] : self.step])
-        if bool(finite.all()) and self._problem.is_finite():
-            self._problem.keep()
-            self._looked = (*self._looked[-1:], self.step)
-            return True
-        self._go_back(newest=bool(finite[:1].all()))
-        return False
-
-    def _go_back(self, *, newest: bool) -> None:
-        failed = self.step
-        self._problem.restore(newest=newest)
-        self.step = self._looked[-1 if newest else 0]
-        self.ending = "diverged"
-        logger.warning(
-            "the loss stopped being a number by step %d; going back to step %d; a learning rate lower than %g may help",
-            failed,
-            self.step,
-            self._settings.learning_rate,
+def _continued(initial: Reconstruction, seed: int | None) -> tuple[Settings, None]:
+    """Return the settings to go on with; the seed is among them, for it has drawn the frequencies."""
+    if not isinstance(initial, Reconstruction):
+        raise SettingsError(
+            f"initial must be a Reconstruction, such as napari_fiberburst.load returns; got {initial!r}"
         )
-
-    def report(self) -> Progress:
-        steps = self.step - 1
-        elapsed = self.seconds - (self._first_done or 0.0)
-        representation = self._problem.representation()
-        every = self._settings.preview_every
-        preview = None
-        if every is not None and self.seconds - self._previewed >= every:
-            preview = self._picture()
-            self._previewed = self.seconds
-        self._reported = self.seconds
-        return Progress(
-            step=self.step,
-            iterations=self._settings.iterations,
-            loss=float(self._losses[self.step - 1]),
-            seconds=self.seconds,
-            rate=steps / elapsed if steps and elapsed > 0 else 0.0,
-            homographies=representation.homographies(),
-            preview=preview,
+    if seed not in (None, 0, initial.settings.seed):
+        raise SettingsError(
+            f"a continued run keeps its seed, {initial.settings.seed}; got {seed}; leave it out, or start anew"
         )
-
-    def finish(self) -> Reconstruction:
-        """Return the result of the steps done, or of the last good one."""
-        if self.ending != "diverged":
-            self.is_healthy()
-        image = self._picture()
-        if not np.isfinite(image).all():  # no loss was taken after the last step to tell
-            self._go_back(newest=False)
-            image = self._picture()
-        representation = self._problem.representation()
-        losses = self._losses[: self.step].cpu().numpy()
-        before = self._initial
-        return Reconstruction(
-            image=image,
-            canvas=self._canvas,
-            homographies=representation.homographies(),
-            losses=losses if before is None else np.concatenate([before.losses, losses]),
-            settings=self._settings,
-            seconds=self.seconds + (0.0 if before is None else before.seconds),
-            parameters=self._problem.field.parameter_count,
-            device=str(self._device),
-            ending=self.ending,
-            acquisition=self._burst.acquisition,
-            renderer=representation,
-        )
-
-    @property
-    def _canvas(self) -> Canvas:
-        return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]))
-
-    def _picture(self) -> NDArray[np.float32]:
-        values = self._problem.representation().render(self._canvas.points(), 0)
-        return self._burst.in_original_units(values)
+    # How long to run and what to show belong to the run, not to what it has made.
+    return replace(initial.settings, time_budget=None, preview_every=None), None

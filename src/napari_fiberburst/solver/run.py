@@ -1,0 +1,205 @@
+"""One run: its clock, its losses, its reports, and the states it can go back to."""
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.burst import Burst
+from napari_fiberburst.control import Control
+from napari_fiberburst.reconstruction import Canvas, Ending, Reconstruction, draw
+from napari_fiberburst.settings import Fourier, Settings
+from napari_fiberburst.solver.device import find_device
+from napari_fiberburst.solver.problem import Problem, State
+from napari_fiberburst.solver.progress import Progress
+
+logger = logging.getLogger(__name__)
+
+# Reports make the host wait for the device, so there are few of them, and more would not be seen.
+_SECONDS_BETWEEN_REPORTS = 0.1
+# Keeping a state copies the networks and Adam's moments.
+_SECONDS_BETWEEN_KEPT_STATES = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kept:
+    """A state to go back to, after `step` steps."""
+
+    step: int
+    settings: Settings
+    state: State
+
+
+class Run:
+    """The bookkeeping of one run.
+
+    Parameters
+    ----------
+    burst, settings, initial
+        As in `napari_fiberburst.iterate`.
+
+    Attributes
+    ----------
+    step : int
+        Steps done.
+    ending : str
+        Why the run ended, once it has.
+    """
+
+    def __init__(self, burst: Burst, settings: Settings, initial: Reconstruction | None) -> None:
+        self._burst = burst
+        self._settings = settings
+        self._initial = initial
+        self._device = find_device(settings.device)
+        self._problem = Problem(burst, settings, self._device, initial)
+        self._canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]))
+        self._losses: list[float] = []
+        self._pending: list[Tensor] = []
+        self._kept: tuple[_Kept, ...] = (_Kept(0, settings, self._problem.state()),)
+        self._live_sigma: float | None = None
+        self._first_done = self._reported = self._previewed = self._kept_at = 0.0
+        self.step = 0
+        self.ending: Ending = "finished"
+        # The first set-up in a process loads much of torch, which is not the run's to answer for.
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start, pauses left out."""
+        return time.perf_counter() - self._started
+
+    def hold_while_paused(self, control: Control, should_stop: Callable[[], bool] | None) -> None:
+        """Wait while the run is paused, and take the wait out of its time."""
+        paused_at = time.perf_counter()
+        control.wait_while_paused(should_stop)
+        self._started += time.perf_counter() - paused_at
+
+    def is_out_of_time(self) -> bool:
+        """Whether the time budget is spent; never before the first step."""
+        budget = self._settings.time_budget
+        return budget is not None and self.step > 0 and self.seconds >= budget
+
+    def follow(self, control: Control) -> None:
+        """Take over what a user has changed since the last step."""
+        rate, sigma = control.learning_rate, control.sigma
+        if rate is not None and rate != self._settings.learning_rate:
+            self._problem.set_learning_rate(rate)
+            self._settings = replace(self._settings, learning_rate=rate)
+        if sigma is None or sigma == self._live_sigma:
+            return
+        self._live_sigma = sigma
+        encoding = self._settings.encoding
+        if isinstance(encoding, Fourier):
+            self._problem.field.scene.set_sigma(sigma)
+            self._settings = replace(self._settings, encoding=replace(encoding, sigma=sigma))
+        else:
+            logger.warning("sigma %g has no effect: encoding %s has no frequency spread", sigma, encoding.name)
+
+    def advance(self) -> None:
+        """Take one step. The loss stays on the device until someone looks."""
+        self._pending.append(self._problem.step())
+        self.step += 1
+        if self.step == 1:
+            self._first_done = self.seconds
+
+    def is_report_due(self) -> bool:
+        """Whether it is time to look; the last step is reported at the end."""
+        due = self.step == 1 or self.seconds - self._reported >= _SECONDS_BETWEEN_REPORTS
+        return due and self.step < self._settings.iterations
+
+    def is_healthy(self) -> bool:
+        """Whether all losses and all parameters are numbers; else go back to when they were."""
+        if self._pending:
+            self._losses += torch.stack(self._pending).tolist()
+            self._pending.clear()
+        if np.isfinite(self._losses).all() and self._problem.is_finite():
+            if self.seconds - self._kept_at >= _SECONDS_BETWEEN_KEPT_STATES:
+                self._kept = (self._kept[-1], _Kept(self.step, self._settings, self._problem.state()))
+                self._kept_at = self.seconds
+            return True
+        self._go_back()
+        return False
+
+    def finish(self) -> None:
+        """Make sure that what is there can be drawn, by going back where it cannot."""
+        if self.ending != "diverged" and self.is_healthy():
+            self._image = self._picture()
+            if np.isfinite(self._image).all():
+                return
+            self._go_back()  # no loss was taken after the last step to tell
+        self._image = self._picture()
+
+    def report(self, *, last: bool = False) -> Progress:
+        """Return where the run stands."""
+        settings = self._settings
+        preview = self._image if last and settings.preview_every is not None else None
+        if not last and settings.preview_every is not None and self.seconds - self._previewed >= settings.preview_every:
+            preview = self._picture()
+            self._previewed = self.seconds
+        now = self._reported = self.seconds
+        rate = (self.step - 1) / (now - self._first_done) if self.step > 1 else 0.0
+        return Progress(
+            step=self.step,
+            iterations=settings.iterations,
+            loss=self._losses[-1],
+            seconds=now,
+            rate=rate,
+            remaining=0.0 if last else self._remaining(rate, now),
+            homographies=self._problem.representation().homographies(),
+            preview=preview,
+        )
+
+    def result(self) -> Reconstruction:
+        """Return what the run has come to."""
+        representation = self._problem.representation()
+        losses = np.array(self._losses, dtype=np.float32)
+        before = self._initial
+        return Reconstruction(
+            image=self._image,
+            canvas=self._canvas,
+            homographies=representation.homographies(),
+            losses=losses if before is None else np.concatenate([before.losses, losses]),
+            settings=self._settings,
+            seconds=self.seconds + (0.0 if before is None else before.seconds),
+            parameters=self._problem.field.parameter_count,
+            device=str(self._device),
+            ending=self.ending,
+            acquisition=self._burst.acquisition,
+            renderer=representation,
+        )
+
+    def _remaining(self, rate: float, now: float) -> float | None:
+        budget = self._settings.time_budget
+        limits = [] if budget is None else [max(0.0, budget - now)]
+        if rate > 0:
+            limits.append((self._settings.iterations - self.step) / rate)
+        return min(limits, default=None)
+
+    def _go_back(self) -> None:
+        """Return to the newest kept state that is known to be good.
+
+        The loss of a step is taken before the step, so a state is known to be good by the loss that came next.
+        """
+        failed = np.flatnonzero(~np.isfinite(self._losses))
+        first_bad = int(failed[0]) if failed.size else len(self._losses)
+        good = [kept for kept in self._kept if kept.step < first_bad]
+        back = good[-1] if good else self._kept[0]
+        logger.warning(
+            "the fit stopped giving numbers by step %d; going back to step %d; a learning rate lower than %g may help",
+            self.step,
+            back.step,
+            self._settings.learning_rate,
+        )
+        self._problem.restore(back.state)
+        self._settings = back.settings
+        self._losses = self._losses[: back.step]
+        self.step = back.step
+        self.ending = "diverged"
+
+    def _picture(self) -> NDArray[np.float32]:
+        return draw(self._problem.representation(), self._canvas, 0, self._burst)
