@@ -1,6 +1,7 @@
 """Reconstruction and Canvas: where pictures lie, at any size."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,6 +148,14 @@ def test_provenance_is_json(result):
     assert told["settings"]["encoding"]["name"] == "fourier"
     assert np.shape(told["homographies"]) == (5, 3, 3)
     assert len(told["losses"]) == 60
+
+
+def test_homographies_that_say_nothing_are_none_in_json(result):
+    unknown = result.homographies.copy()
+    unknown[2] = np.nan
+    told = json.loads(json.dumps(replace(result, homographies=unknown).provenance(), allow_nan=False))
+    assert told["homographies"][2] == [[None] * 3] * 3
+    assert told["homographies"][0] == np.eye(3).tolist()
 
 
 def test_a_saved_representation_draws_the_same_picture(result, tmp_path):

@@ -14,6 +14,7 @@ from napari_fiberburst.io.results import is_representation, write_picture, write
 from napari_fiberburst.settings import Settings
 
 _BAND_PIXELS = 2**17
+_NOTHING = np.array(None, dtype=object)
 _MOST_PIXELS = 2**31
 
 Ending = Literal["finished", "stopped", "time budget", "diverged"]
@@ -227,7 +228,7 @@ class Reconstruction:
         return self.renderer.displacement(Canvas.over(self._field).points(), self._number(t))
 
     def provenance(self) -> dict[str, Any]:
-        """Return where the picture came from, as plain values that JSON can hold."""
+        """Return where the picture came from, as plain values that JSON can hold; None stands for NaN."""
         return {
             "settings": self.settings.to_dict(),
             "seed": self.settings.seed,
@@ -241,7 +242,9 @@ class Reconstruction:
                 "frame0_from_image": self.canvas.frame0_from_image.tolist(),
             },
             "burst": self.acquisition.to_dict(),
-            "homographies": self.homographies.tolist(),
+            "homographies": np.where(
+                np.isfinite(self.homographies), self.homographies.astype(object), _NOTHING
+            ).tolist(),
             "losses": [float(loss) for loss in self.losses],
         }
 
