@@ -7,6 +7,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from napari_fiberburst import quality as quality
+    from napari_fiberburst import settings as settings
+    from napari_fiberburst import simulation as simulation
     from napari_fiberburst.burst import Burst as Burst
     from napari_fiberburst.control import Control as Control
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
@@ -33,11 +36,15 @@ _HOMES = {
     "reconstruct": "solver",
 }
 
-__all__ = sorted(_HOMES)
+_MODULES = ("quality", "settings", "simulation")
+
+__all__ = sorted([*_HOMES, *_MODULES])
 
 
 def __getattr__(name: str) -> object:
     """Import a public name from its module the first time it is asked for (PEP 562)."""
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
@@ -46,4 +53,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES})
+    return sorted({*globals(), *__all__})

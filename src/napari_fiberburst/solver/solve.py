@@ -30,6 +30,7 @@ def reconstruct(
     seed: int | None = 0,
     on_progress: Callable[[Progress], object] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    time_budget: float | None = None,
     control: Control | None = None,
     initial: Reconstruction | None = None,
     **more: Any,
@@ -59,6 +60,8 @@ def reconstruct(
         Called with a `Progress` some ten times a second at most, in this thread.
     should_stop : callable, optional
         Asked before every step, and while paused; where it returns True the run ends with what it has.
+    time_budget : float, optional
+        Seconds, from the first step on, after which the run ends with what it has.
     control : Control, optional
         To stop, pause and resume the run from another thread, and change its sigma and learning rate.
     initial : Reconstruction, optional
@@ -67,8 +70,8 @@ def reconstruct(
         exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
         Adam's moments start anew.
     **more
-        Any other field of `Settings`, or of the motion or the encoding chosen, by name: ``time_budget=10.0``,
-        ``learning_rate=1e-3``, ``features=128``.
+        Any other field of `Settings`, or of the motion or the encoding chosen, by name: ``learning_rate=1e-3``,
+        ``features=128``, ``preview_every=1.0``.
 
     Returns
     -------
@@ -103,6 +106,7 @@ def reconstruct(
         iterations=iterations,
         device=device,
         seed=seed,
+        time_budget=time_budget,
         **more,
     )
     for name, called in (("on_progress", on_progress), ("should_stop", should_stop)):
