@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench bench-quality clean
 
 demo: .venv/base
 	mkdir -p demo
@@ -25,6 +25,10 @@ bench: .venv/base
 	$(BIN)/python benchmarks/step.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/startup.py
+	$(BIN)/python benchmarks/speed.py
+
+bench-quality: .venv/base
+	$(BIN)/python benchmarks/quality.py
 
 clean:
 	rm -rf .venv demo .coverage .mypy_cache .pytest_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""Watch a fit while it happens, change its sigma on the way, stop it early, and continue it."""
+"""Watch the published method while it fits, change its sigma on the way, stop it early, and continue it."""
 
 import os
 
@@ -22,7 +22,15 @@ def watch(report: Progress) -> None:
         control.stop()
 
 
-first = reconstruct(burst, sigma=1.0, iterations=iterations, learning_rate=1e-3, on_progress=watch, control=control)
+first = reconstruct(
+    burst,
+    preset="paper",
+    sigma=1.0,
+    iterations=iterations,
+    learning_rate=1e-3,
+    on_progress=watch,
+    control=control,
+)
 print(f"{first.ending} after {len(first.losses)} steps; sigma is {first.settings.encoding}")
 
 # The networks stand for the burst: saved, loaded, drawn at another size, continued.

@@ -35,10 +35,10 @@ def tiny_burst(tiny_simulation: SimulatedBurst) -> Burst:
 
 @pytest.fixture(scope="session")
 def fit() -> Callable[..., Reconstruction]:
-    """Return `reconstruct` with small networks on the CPU, ten steps where nothing else is said."""
+    """Return the published `reconstruct` with small networks on the CPU, ten steps where nothing else is said."""
 
     def small_fit(frames: Any, **choices: Any) -> Reconstruction:
-        settings = {**SMALL, "iterations": 10, **choices}
+        settings = {"preset": "paper", **SMALL, "iterations": 10, **choices}
         if settings.get("encoding", "fourier") != "fourier":
             del settings["features"]
         if settings.get("motion", "homography") == "none":

@@ -8,11 +8,13 @@ import napari_fiberburst
 ROOT = Path(napari_fiberburst.__file__).parent
 
 # Each part may import itself and those named here.
-BASE = {"errors", "knobs", "settings", "control", "burst"}
+BASE = {"errors", "knobs", "choices", "settings", "control", "burst", "evidence"}
 ALLOWED = {
     "errors": set(),
     "knobs": {"errors"},
-    "settings": {"errors", "knobs"},
+    "choices": {"errors", "knobs"},
+    "settings": {"errors", "knobs", "choices"},
+    "evidence": set(),
     "control": {"errors", "knobs", "settings"},
     "burst": {"errors"},
     "io": BASE,
@@ -20,11 +22,12 @@ ALLOWED = {
     "reconstruction": BASE | {"io"},
     "quality": BASE,
     "geometry": BASE,
+    "optics": BASE | {"geometry"},
     "fields": BASE | {"geometry"},
-    "solver": BASE | {"io", "reconstruction", "geometry", "fields"},
+    "solver": BASE | {"io", "reconstruction", "quality", "geometry", "optics", "fields"},
     "cli": BASE | {"io", "simulation", "reconstruction", "quality", "solver", ""},
 }
-TORCH = {"geometry", "fields", "solver"}
+TORCH = {"geometry", "optics", "fields", "solver"}
 QT = {"qtpy", "magicgui", "superqt", "napari", "pyqtgraph"}
 
 

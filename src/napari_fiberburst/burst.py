@@ -12,7 +12,7 @@ from napari_fiberburst.errors import BurstError
 
 MIN_FRAMES = 2
 MIN_SIDE = 16
-_FULL_SCALES = tuple(2**bits - 1 for bits in (8, 10, 12, 14, 16, 32))
+_FULL_SCALES = tuple(2**bits - 1 for bits in range(8, 33, 2))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,7 +89,7 @@ class Burst(Acquisition):
         C must have length 1 and are dropped. S (samples) and C are the same.
     black_level, white_level : float, optional
         Intensities that become 0 and 1; what lies beyond is clipped. For integers the default is 0 and the least
-        of 8, 10, 12, 14, 16 or 32 bit full scale that holds all values; for floats 0 and 1, widened where values
+        full scale of 8, 10, 12 and so on up to 32 bits that holds all values; for floats 0 and 1, widened where values
         lie beyond.
     channel_names : sequence of str, optional
         One name per channel.

@@ -23,7 +23,7 @@ class Knob:
     name : str
         The field's name.
     kind : type
-        int, float or str.
+        int, float, str or bool.
     default : object
         The value it has where nobody turns it.
     doc : str
@@ -52,7 +52,7 @@ class Knob:
         if self.choices:
             words = "one of " + ", ".join(self.choices)
         else:
-            words = {int: "an integer", float: "a number", str: "a text"}[self.kind]
+            words = {int: "an integer", float: "a number", str: "a text", bool: "true or false"}[self.kind]
             bounds = [("of at least", self.least), ("above", self.above), ("of at most", self.most)]
             limits = " and ".join(f"{text} {bound:g}" for text, bound in bounds if bound is not None)
             words = f"{words} {limits}".strip()
@@ -64,6 +64,8 @@ class Knob:
             return self.optional
         if self.kind is str:
             return isinstance(value, str) and (not self.choices or value in self.choices)
+        if self.kind is bool:
+            return isinstance(value, bool)
         wanted = Integral if self.kind is int else Real
         if isinstance(value, bool) or not isinstance(value, wanted):
             return False

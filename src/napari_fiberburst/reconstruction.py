@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.burst import Acquisition
 from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.evidence import Evidence
 from napari_fiberburst.io.results import is_representation, write_picture, write_representation
 from napari_fiberburst.settings import Settings
 
@@ -106,8 +107,8 @@ class Renderer(Protocol):
         """Return the fitted parameters by name."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reconstruction:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reconstruction(Evidence):
     """A clean picture of the scene, the motion of the burst, and how they were made.
 
     Attributes
@@ -137,6 +138,11 @@ class Reconstruction:
         is the last good state.
     acquisition : Acquisition
         What is known of the burst.
+
+    Notes
+    -----
+    What the picture rests on (`coverage`, `uncertainty`, `sample_error`, `cores` and more) is described at
+    `napari_fiberburst.evidence.Evidence`. "Frame 0" stands for the frame `reference` wherever that is another.
     """
 
     image: NDArray[np.float32]
@@ -167,7 +173,8 @@ class Reconstruction:
             Picture pixels to a frame-0 pixel; 2 doubles both sides.
         bounds : (float, float, float, float), optional
             x0, y0, x1, y1 in frame-0 pixels, half-open; default frame 0's field. They may reach beyond it, where
-            only other frames have looked, or none: nothing marks what no frame has seen.
+            only other frames have looked, or none. Behind a calibrated bundle what no core has looked at is NaN; a
+            network fitted as published marks nothing.
 
         Returns
         -------
@@ -180,7 +187,7 @@ class Reconstruction:
             The bounds are empty or the scale is not positive.
         """
         canvas = Canvas.over(self._field if bounds is None else bounds, scale)
-        return draw(self.renderer, canvas, 0, self.acquisition)
+        return draw(self.renderer, canvas, self.reference, self.acquisition)
 
     def frame(self, t: int, scale: float = 1.0) -> NDArray[np.float32]:
         """Draw the clean scene as frame t sees it, I_hat(x, y, t) = f(gamma(T_g(x, y, t))).
@@ -195,7 +202,8 @@ class Reconstruction:
         Returns
         -------
         numpy.ndarray
-            (H, W) or (H, W, C) float32 in the burst's intensity units.
+            (H, W) or (H, W, C) float32 in the burst's intensity units. Behind a calibrated bundle, NaN beyond the
+            canvas and a margin about it, and for frames that were left out.
 
         Raises
         ------
@@ -245,7 +253,8 @@ class Reconstruction:
             "homographies": np.where(
                 np.isfinite(self.homographies), self.homographies.astype(object), _NOTHING
             ).tolist(),
-            "losses": [float(loss) for loss in self.losses],
+            "losses": [float(loss) if np.isfinite(loss) else None for loss in self.losses],
+            **self.summary(),
         }
 
     def save(self, path: str | Path) -> Path:

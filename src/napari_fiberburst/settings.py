@@ -5,121 +5,67 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, ClassVar, get_args
+from typing import Any, Literal
 
+from napari_fiberburst.choices import (
+    ENCODINGS as ENCODINGS,
+)
+from napari_fiberburst.choices import (
+    MOTIONS as MOTIONS,
+)
+from napari_fiberburst.choices import (
+    PUBLISHED_MOTIONS as PUBLISHED_MOTIONS,
+)
+from napari_fiberburst.choices import (
+    Affine as Affine,
+)
+from napari_fiberburst.choices import (
+    Encoding as Encoding,
+)
+from napari_fiberburst.choices import (
+    Flow as Flow,
+)
+from napari_fiberburst.choices import (
+    FlowTV as FlowTV,
+)
+from napari_fiberburst.choices import (
+    Fourier as Fourier,
+)
+from napari_fiberburst.choices import (
+    Hash as Hash,
+)
+from napari_fiberburst.choices import (
+    Homography as Homography,
+)
+from napari_fiberburst.choices import (
+    HomographyNetwork as HomographyNetwork,
+)
+from napari_fiberburst.choices import (
+    Motion as Motion,
+)
+from napari_fiberburst.choices import (
+    NeRF as NeRF,
+)
+from napari_fiberburst.choices import (
+    NoEncoding as NoEncoding,
+)
+from napari_fiberburst.choices import (
+    NoMotion as NoMotion,
+)
+from napari_fiberburst.choices import (
+    Similarity as Similarity,
+)
+from napari_fiberburst.choices import (
+    Siren as Siren,
+)
+from napari_fiberburst.choices import (
+    Spline as Spline,
+)
+from napari_fiberburst.choices import (
+    Translation as Translation,
+)
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.knobs import check, knob, knobs_of
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoEncoding:
-    """The coordinates as they are: a smooth picture without fine detail."""
-
-    name: ClassVar[str] = "none"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NeRF:
-    """Sines and cosines at octaves (Mildenhall et al., 2020)."""
-
-    name: ClassVar[str] = "nerf"
-    highest_octave: int = knob(
-        15, "L of the octaves 2^0 to 2^L; more resolve finer detail, noise and honeycomb.", least=0, most=24
-    )
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fourier:
-    """Random Fourier features (Tancik et al., 2020)."""
-
-    name: ClassVar[str] = "fourier"
-    features: int = knob(256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1, most=2**16)
-    sigma: float = knob(
-        5.0,
-        "Frequency spread, cycles per half frame; more resolves finer detail, and in the end the honeycomb.",
-        above=0,
-        most=1e6,
-    )
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hash:
-    """Multi-resolution hash grid (Müller et al., 2022)."""
-
-    name: ClassVar[str] = "hash"
-    levels: int = knob(12, "Grid levels; more resolve finer detail.", least=1, most=24)
-    level_features: int = knob(2, "Learned values per grid point; more can hold more, at more cost.", least=1, most=64)
-    table_bits: int = knob(16, "Binary log of the table length; more means fewer collisions.", least=4, most=24)
-    base_resolution: int = knob(4, "Cells across the frame at the coarsest level.", least=1, most=4096)
-    growth: float = knob(1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1, most=2)
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Siren:
-    """Sine activations instead of an encoding (Sitzmann et al., 2020)."""
-
-    name: ClassVar[str] = "siren"
-    omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4)
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoMotion:
-    """No motion: the scene network memorises space and time, f(x, y, t)."""
-
-    name: ClassVar[str] = "none"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _MotionNetwork:
-    motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1, most=64)
-    motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Homography(_MotionNetwork):
-    """One 3x3 homography per frame: a flat object, seen from anywhere."""
-
-    name: ClassVar[str] = "homography"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Flow(_MotionNetwork):
-    """A displacement per pixel and frame, from a sine network: objects that deform."""
-
-    name: ClassVar[str] = "flow"
-    flow_omega_0: float = knob(
-        30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0, most=1e4
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlowTV(Flow):
-    """Optical flow with total variation: displacements that change little from pixel to pixel."""
-
-    name: ClassVar[str] = "flow_tv"
-    tv_weight: float = knob(1.0, "Weight of the flow's total variation; more makes it smoother.", least=0)
-
-
-Encoding = NoEncoding | NeRF | Fourier | Hash | Siren
-Motion = NoMotion | Homography | Flow | FlowTV
-
-ENCODINGS: Mapping[str, type[Encoding]] = {choice.name: choice for choice in get_args(Encoding)}
-MOTIONS: Mapping[str, type[Motion]] = {choice.name: choice for choice in get_args(Motion)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,25 +74,45 @@ class Settings:
 
     Attributes
     ----------
-    motion : NoMotion, Homography, Flow or FlowTV
+    motion : Motion
         How the object moves between frames.
-    encoding : NoEncoding, NeRF, Fourier, Hash or Siren
-        How coordinates are presented to the scene network.
+    encoding : Encoding
+        How the scene is held: as a spline, or as a network of coordinates that are presented in one of these ways.
 
     Notes
     -----
     The other attributes are knobs; `napari_fiberburst.knobs.knobs_of` lists them with their text and range.
-    The defaults are the published ones ("Seeing through fibers", 2026).
+    The defaults are the preset "auto"; what is None there is chosen from the burst.
     """
 
     motion: Motion = field(default_factory=Homography)
-    encoding: Encoding = field(default_factory=Fourier)
+    encoding: Encoding = field(default_factory=Spline)
+    observation: Literal["auto", "cores", "pixels", "frames"] = knob(
+        "auto",
+        "What is taken as one sensor behind the self-calibrated bundle: each core, each lit pixel, or, auto, what the "
+        "burst itself shows; frames stands for the published method, which has no bundle model.",
+    )
+    canvas: Literal["frame", "union"] = knob(
+        "frame", "What the picture covers: the first frame's field, or all that any frame saw."
+    )
+    upsample: float = knob(1.0, "Picture pixels to a frame pixel, along each axis.", above=0, most=16)
+    fill: bool = knob(False, "Fill in the picture where no core has looked, instead of leaving it empty (NaN).")
+    held_out: float = knob(
+        0.05, "Part of the samples that is left out of the fit and tells how well it predicts.", least=0, most=0.5
+    )
     scene_layers: int = knob(4, "Hidden layers of the scene network.", least=1, most=64)
     scene_width: int = knob(
         256, "Units per hidden layer of the scene network; more holds more detail.", least=1, most=2**14
     )
-    iterations: int = knob(3000, "Optimisation steps; more fits closer, in the end noise too.", least=1)
-    learning_rate: float = knob(1e-4, "Step size of Adam; more is faster and less stable.", above=0, most=1e6)
+    iterations: int | None = knob(
+        None, "Optimisation steps at most; more fits closer, in the end noise too. None lets the burst choose.", least=1
+    )
+    learning_rate: float | None = knob(
+        None,
+        "Step size of Adam; more is faster and less stable. None suits the encoding; as published, 1e-4.",
+        above=0,
+        most=1e6,
+    )
     batch: int | None = knob(None, "Samples per step; None takes an eighth of a frame's pixels, as published.", least=1)
     seed: int = knob(0, "Seed of everything random; the same seed gives the same picture.", least=0, most=2**31 - 1)
     device: str = knob("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
@@ -158,11 +124,31 @@ class Settings:
     )
 
     def __post_init__(self) -> None:
-        for part, known in ((self.motion, MOTIONS), (self.encoding, ENCODINGS)):
-            if type(part) not in known.values():
+        for part, known in (("motion", self.motions), ("encoding", ENCODINGS)):
+            if type(getattr(self, part)) not in known.values():
                 names = ", ".join(choice.__name__ for choice in known.values())
-                raise SettingsError(f"expected a settings object, one of {names}; got {part!r}")
+                raise SettingsError(
+                    f"with observation {self.observation!r}, {part} must be one of {names}; got {getattr(self, part)!r}"
+                )
         check(self)
+        if self.is_published and isinstance(self.encoding, Spline):
+            raise SettingsError("the spline needs a bundle model; observation frames goes with a network encoding")
+        if self.is_published and self.canvas != "frame":
+            raise SettingsError("observation frames draws the first frame's field alone; canvas must be frame")
+        if isinstance(self.encoding, Spline) and isinstance(self.motion, Flow):
+            raise SettingsError(
+                f"motion {self.motion.name} needs a network encoding: {', '.join(list(ENCODINGS)[1:])}; not the spline"
+            )
+
+    @property
+    def is_published(self) -> bool:
+        """Whether this is the published method, without a bundle model."""
+        return self.observation == "frames"
+
+    @property
+    def motions(self) -> Mapping[str, type[Motion]]:
+        """The motions that go with the observation, by name."""
+        return PUBLISHED_MOTIONS if self.is_published else MOTIONS
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values that JSON can hold; `from_dict` reads them back."""
@@ -188,12 +174,25 @@ class Settings:
         return choose(**flat)
 
 
-_ALL_NAMES = {item.name for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()) for item in fields(owner)}
+_ALL_NAMES = {
+    item.name
+    for owner in (Settings, *MOTIONS.values(), *PUBLISHED_MOTIONS.values(), *ENCODINGS.values())
+    for item in fields(owner)
+}
 
-PRESETS: Mapping[str, Settings] = {"paper": Settings()}
+PRESETS: Mapping[str, Settings] = {
+    "auto": Settings(),
+    "paper": Settings(
+        motion=HomographyNetwork(),
+        encoding=Fourier(sigma=5.0),
+        observation="frames",
+        iterations=3000,
+        learning_rate=1e-4,
+    ),
+}
 
 
-def choose(preset: str | Settings = "paper", **choices: Any) -> Settings:
+def choose(preset: str | Settings = "auto", **choices: Any) -> Settings:
     """Return a preset with some of its values replaced.
 
     Parameters
@@ -214,7 +213,8 @@ def choose(preset: str | Settings = "paper", **choices: Any) -> Settings:
         if name not in _ALL_NAMES:
             raise SettingsError(_misplaced(name, settings, settings.motion, settings.encoding))
     given = {name: value for name, value in choices.items() if value is not None}
-    motion = _part("motion", given.pop("motion", settings.motion), settings.motion, MOTIONS)
+    settings = _observed(settings, given.pop("observation", settings.observation))
+    motion = _part("motion", given.pop("motion", settings.motion), settings.motion, settings.motions)
     encoding = _part("encoding", given.pop("encoding", settings.encoding), settings.encoding, ENCODINGS)
     own, of_motion, of_encoding = (
         {name: given.pop(name) for name in knobs_of(type(part)) if name in given}
@@ -223,6 +223,19 @@ def choose(preset: str | Settings = "paper", **choices: Any) -> Settings:
     if given:
         raise SettingsError(_misplaced(next(iter(given)), settings, motion, encoding))
     return replace(settings, motion=replace(motion, **of_motion), encoding=replace(encoding, **of_encoding), **own)
+
+
+def _observed(settings: Settings, observation: Any) -> Settings:
+    """Return the settings with another observation; where it has the other family of motions, with its namesake."""
+    known = knobs_of(Settings)["observation"]
+    if not known.allows(observation):
+        raise SettingsError(f"observation must be {known.expected}; got {observation!r}")
+    if (observation == "frames") == settings.is_published:
+        return replace(settings, observation=observation)
+    changed = PRESETS["paper" if observation == "frames" else "auto"]
+    motion = changed.motions.get(settings.motion.name, type(changed.motion))()
+    encoding = changed.encoding if isinstance(settings.encoding, Spline) else settings.encoding
+    return replace(settings, observation=observation, motion=motion, encoding=encoding)
 
 
 def choice_docs() -> Iterator[tuple[str, str, str]]:

@@ -13,7 +13,7 @@ import tifffile
 
 from napari_fiberburst.cli import demo, main
 
-SMALL = ["--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
+SMALL = ["--preset", "paper", "--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_reconstruct_can_write_the_networks(burst_file, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (["--sigma", "-1"], "sigma must be a number above 0 and"),
+        (["--preset", "paper", "--sigma", "-1"], "sigma must be a number above 0 and"),
         (["--encoding", "siren", "--sigma", "3"], "belongs to encoding 'fourier'"),
         (["--crop", "0:99,0:20"], "within 0:33"),
         (["--device", "cuda:77"], "is not on this machine"),
@@ -131,8 +131,11 @@ def test_help_comes_from_the_settings(capsys):
         main(["reconstruct", "--help"])
     told = " ".join(capsys.readouterr().out.split())
     assert "Frequency spread, cycles per half frame; more resolves finer detail" in told
-    assert "(fourier only; default 5.0)" in told
-    assert "homography: One 3x3 homography per frame" in told
+    assert "--smoothness" in told
+    assert "(spline only)" in told
+    assert "homography: One homography per frame" in told
+    assert "--canvas {frame,union}" in told
+    assert "--fill, --no-fill" in told
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
@@ -178,16 +181,16 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path):
 
 
 def test_the_demo_prints_its_figures_and_draws(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(demo, "_BURST", {**demo._BURST, "shape": (49, 57), "frames": 3})
+    monkeypatch.setattr(demo, "_BURST", {**demo._BURST, "shape": (97, 113), "frames": 5})
     out = tmp_path / "demo.png"
-    assert main(["demo", "-o", str(out), "--iterations", "3", "--device", "cpu"]) == 0
+    assert main(["demo", "-o", str(out), "--device", "cpu"]) == 0
     told = capsys.readouterr().out
     for line in ("captured frame", "Gaussian filter", "reconstruction", "motion off by"):
         assert line in told
     from imageio.v3 import imread
 
     picture = imread(out)
-    assert picture.shape[1] == 4 * 57 + 3 * 8
+    assert picture.shape[1] == 4 * 113 + 3 * 8
     assert picture.std() > 20
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from napari_fiberburst.fields.motion import make_motion
-from napari_fiberburst.settings import Flow, FlowTV, Homography, NoMotion
+from napari_fiberburst.settings import Flow, FlowTV, HomographyNetwork, NoMotion
 
 
 def seeded():
@@ -29,7 +29,7 @@ def test_still_adds_the_time():
 
 
 def test_homography_gradients_agree_with_finite_differences():
-    field = stirred(Homography(motion_width=5, motion_layers=1)).double()
+    field = stirred(HomographyNetwork(motion_width=5, motion_layers=1)).double()
     frames = torch.tensor([0, 1, 3])
     points = torch.rand(3, 2, dtype=torch.float64, generator=seeded()).requires_grad_()
     names = [name for name, _ in field.named_parameters()]
@@ -41,7 +41,7 @@ def test_homography_gradients_agree_with_finite_differences():
     assert torch.autograd.gradcheck(mapped, (points, *values), eps=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("choice", [Homography(), Flow(flow_omega_0=5.0)])
+@pytest.mark.parametrize("choice", [HomographyNetwork(), Flow(flow_omega_0=5.0)])
 def test_frame0_points_show_the_same_place_of_the_scene(choice):
     field = stirred(choice)
     points, frames = torch.rand(40, 2, generator=seeded()) * 2 - 1, torch.arange(40) % 4
@@ -76,5 +76,5 @@ def test_total_variation_is_the_mean_absolute_jacobian():
 
 def test_only_flow_with_total_variation_has_a_prior():
     points, frames = torch.rand(5, 2), torch.zeros(5, dtype=torch.long)
-    for choice in (NoMotion(), Homography(), Flow(), FlowTV(tv_weight=0)):
+    for choice in (NoMotion(), HomographyNetwork(), Flow(), FlowTV(tv_weight=0)):
         assert make_motion(choice, 2, seeded()).roughness(points, frames) is None

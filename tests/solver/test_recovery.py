@@ -37,7 +37,9 @@ def simulated():
 
 @pytest.mark.parametrize("encoding", COARSE)
 def test_homographies_and_scene_through_a_bundle(simulated, encoding):
-    result = reconstruct(simulated.burst, encoding=encoding, iterations=600, **COARSE[encoding], **NETWORKS)
+    result = reconstruct(
+        simulated.burst, preset="paper", encoding=encoding, iterations=600, **COARSE[encoding], **NETWORKS
+    )
     unregistered = motion_error(UNMOVED, simulated.homographies, SHAPE)
     assert motion_error(result.homographies, simulated.homographies, SHAPE) < 0.5 * unregistered
     assert_better_than_the_frames(result, simulated)
@@ -53,7 +55,7 @@ def test_homographies_and_scene_through_a_bundle(simulated, encoding):
 )
 def test_optical_flow_and_scene_through_a_bundle(simulated, motion):
     choices = {**motion, **COARSE["fourier"], **NETWORKS, "motion_layers": 2}
-    result = reconstruct(simulated.burst, iterations=400, **choices)
+    result = reconstruct(simulated.burst, preset="paper", iterations=400, **choices)
     assert flow_error(result.flow, simulated.homographies) < 0.6 * flow_error(no_flow, simulated.homographies)
     assert_better_than_the_frames(result, simulated)
 
@@ -61,13 +63,15 @@ def test_optical_flow_and_scene_through_a_bundle(simulated, motion):
 @pytest.mark.parametrize("encoding", COARSE)
 def test_homographies_without_a_bundle(simulated, encoding):
     burst = Burst(simulated.truth)
-    result = reconstruct(burst, encoding=encoding, iterations=500, **COARSE[encoding], **NETWORKS)
+    result = reconstruct(burst, preset="paper", encoding=encoding, iterations=500, **COARSE[encoding], **NETWORKS)
     assert motion_error(result.homographies, simulated.homographies, SHAPE) < 1.0
 
 
 def test_no_motion_memorises_every_frame(simulated):
     choices = {name: value for name, value in NETWORKS.items() if name != "motion_width"}
-    result = reconstruct(Burst(simulated.truth), motion="none", iterations=300, **COARSE["fourier"], **choices)
+    result = reconstruct(
+        Burst(simulated.truth), preset="paper", motion="none", iterations=300, **COARSE["fourier"], **choices
+    )
     for t in (0, 3, 7):
         errors = [np.mean((result.frame(t) - frame) ** 2) for frame in simulated.truth]
         assert np.argmin(errors) == t
@@ -81,7 +85,7 @@ def test_the_order_of_the_other_frames_does_not_matter():
     shuffled = Burst(simulated.burst.frames[[0, 5, 2, 7, 1, 6, 3, 4]])
     scores = []
     for frames in (simulated.burst, shuffled):
-        first = reconstruct(frames, encoding="siren", iterations=600, **COARSE["siren"], **NETWORKS)
+        first = reconstruct(frames, preset="paper", encoding="siren", iterations=600, **COARSE["siren"], **NETWORKS)
         settled = reconstruct(frames, initial=first, iterations=200, learning_rate=1e-4)
         scores.append(psnr(settled.image, simulated.truth[0]))
     assert scores[1] == pytest.approx(scores[0], abs=0.5)

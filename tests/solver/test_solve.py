@@ -66,7 +66,7 @@ def test_the_picture_is_in_the_units_of_the_burst(fit, rng):
 def test_the_same_call_twice_gives_the_same_bits_with_threads_at_work():
     # Batches large enough for torch to share them out among threads.
     burst = simulate("cat", shape=(97, 129), frames=8, pitch=2.2).burst
-    choices = {"iterations": 6, "batch": 10_000, "scene_width": 32, "features": 32, "device": "cpu"}
+    choices = {"preset": "paper", "iterations": 6, "batch": 10_000, "scene_width": 32, "features": 32, "device": "cpu"}
     first = reconstruct(burst, **choices)
     for _ in range(4):
         same(reconstruct(burst, **choices), first)
@@ -128,7 +128,7 @@ def test_no_previews_are_drawn_unless_asked_for(fit, tiny_burst):
 
 
 def test_the_loss_is_the_mean_squared_error_of_its_samples(tiny_burst):
-    settings = choose(iterations=1, scene_width=8, motion_width=8, batch=100, device="cpu")
+    settings = choose("paper", iterations=1, scene_width=8, motion_width=8, batch=100, device="cpu")
     problem = Problem(tiny_burst, settings, torch.device("cpu"))
     batch = Samples(tiny_burst, torch.device("cpu"), seed=0).draw(100)
     with torch.no_grad():
@@ -137,9 +137,9 @@ def test_the_loss_is_the_mean_squared_error_of_its_samples(tiny_burst):
 
 
 def test_a_step_takes_an_eighth_of_a_frame_unless_told(tiny_burst):
-    published = Problem(tiny_burst, choose(), torch.device("cpu"))
+    published = Problem(tiny_burst, choose("paper"), torch.device("cpu"))
     assert published.batch == -(-31 * 37 // 8)
-    assert Problem(tiny_burst, choose(batch=7), torch.device("cpu")).batch == 7
+    assert Problem(tiny_burst, choose("paper", batch=7), torch.device("cpu")).batch == 7
 
 
 def test_stopping_gives_a_usable_result(fit, tiny_burst):
@@ -242,7 +242,7 @@ def test_what_broke_a_run_is_not_in_the_settings_it_goes_back_to(fit, tiny_burst
 
     result = fit(tiny_burst, iterations=2000, control=control, on_progress=turn)
     assert result.ending == "diverged"
-    assert result.settings.learning_rate == choose().learning_rate
+    assert result.settings.learning_rate == choose("paper").learning_rate
     longer = fit(tiny_burst, initial=result, iterations=5)
     assert longer.ending == "finished"
 
@@ -290,7 +290,7 @@ def test_a_spent_budget_is_not_inherited(fit, tiny_burst):
 
 
 def test_a_run_continues_with_its_own_settings(tiny_burst):
-    first = reconstruct(tiny_burst, encoding="siren", omega_0=7.0, iterations=2, batch=50, device="cpu")
+    first = reconstruct(tiny_burst, preset="paper", encoding="siren", omega_0=7.0, iterations=2, batch=50, device="cpu")
     assert reconstruct(tiny_burst, initial=first, iterations=1).settings.encoding == first.settings.encoding
 
 
@@ -344,7 +344,7 @@ def test_settings_are_checked_before_the_burst_is_read():
 
 
 def test_iterate_is_a_generator_that_returns_the_reconstruction(tiny_burst):
-    run = iterate(tiny_burst, choose(iterations=2, batch=50, device="cpu"))
+    run = iterate(tiny_burst, choose("paper", iterations=2, batch=50, device="cpu"))
     steps = []
     while True:
         try:

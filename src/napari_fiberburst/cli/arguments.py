@@ -4,7 +4,9 @@ import argparse
 from typing import Any, NoReturn
 
 from napari_fiberburst.knobs import Knob, knobs_of
-from napari_fiberburst.settings import ENCODINGS, MOTIONS, PRESETS, Settings, choice_docs
+from napari_fiberburst.settings import ENCODINGS, MOTIONS, PRESETS, PUBLISHED_MOTIONS, Settings, choice_docs
+
+_OWNERS = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
@@ -15,7 +17,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{part}", choices=known, help=" ".join(texts).replace("%", "%%"))
     owners: dict[str, list[str]] = {}
     knobs: dict[str, Knob] = {}
-    for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()):
+    for owner in _OWNERS:
         for name, knob in knobs_of(owner).items():
             knobs.setdefault(name, knob)
             owners.setdefault(name, []).append(getattr(owner, "name", ""))
@@ -26,7 +28,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return what `napari_fiberburst.settings.choose` takes, from parsed options; unset ones are None."""
     names = {"preset", "motion", "encoding"}
-    for owner in (Settings, *MOTIONS.values(), *ENCODINGS.values()):
+    for owner in _OWNERS:
         names |= set(knobs_of(owner))
     return {name: getattr(options, name) for name in sorted(names)}
 
@@ -54,6 +56,12 @@ def _add(parser: argparse.ArgumentParser, knob: Knob, owner: str) -> None:
     default = "" if knob.default is None else f"default {knob.default}"
     remarks = "; ".join(filter(None, [owner and f"{owner} only", default]))
     text = f"{knob.doc} ({remarks})" if remarks else knob.doc
+    if knob.kind is bool:
+        parser.add_argument(f"--{knob.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
+        return
+    if knob.choices:
+        parser.add_argument(f"--{knob.name.replace('_', '-')}", choices=knob.choices, help=text)
+        return
     parser.add_argument(
         f"--{knob.name.replace('_', '-')}", type=knob.kind, metavar=knob.kind.__name__.upper(), help=text
     )

@@ -38,6 +38,9 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.add_argument("--black-level", type=float, help="intensity that stands for no light")
+    parser.add_argument(
+        "--calibration", type=Path, help="picture of the bundle with nothing but even light before it; never needed"
+    )
     parser.add_argument("--white-level", type=float, help="intensity that stands for full scale")
     add_settings(parser)
     parser.set_defaults(run=run)
@@ -61,14 +64,21 @@ def run(options: argparse.Namespace) -> int:
     with stop_on_interrupt(control), tqdm(total=settings.iterations, unit="it") as bar:
 
         def show(report: Progress) -> None:
+            bar.total = report.iterations
             bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
             bar.update(report.step - bar.n)
 
-        result = reconstruct(burst, **choices, control=control, on_progress=show)
+        result = reconstruct(burst, **choices, calibration=options.calibration, control=control, on_progress=show)
         result.save(options.output)
     steps = len(result.losses)
     rate = steps / result.seconds
     print(f"{result.ending} after {steps} steps in {result.seconds:.1f} s on {result.device}, {rate:.1f} it/s")
+    if result.frames_used is not None:
+        print(f"frames used {len(result.frames_used)} of {len(result.homographies)}")
+    if result.sample_error is not None:
+        print(f"samples left out are met to {result.sample_error:.3g} intensity units")
+    if result.resolution is not None:
+        print(f"two halves of the burst agree down to periods of {result.resolution:.1f} pixels")
     if result.compression > 0:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     print(f"wrote {options.output}")

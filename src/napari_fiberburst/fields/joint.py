@@ -17,12 +17,14 @@ class JointField(nn.Module):
         Motion, encoding and sizes of the networks, and the seed of their start.
     frames, channels : int
         Of the burst.
+    start : Tensor, optional
+        (T, 3, 3) homographies in unit coordinates, from a registration.
     """
 
-    def __init__(self, settings: Settings, frames: int, channels: int) -> None:
+    def __init__(self, settings: Settings, frames: int, channels: int, start: Tensor | None = None) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(settings.seed)
-        self.motion = make_motion(settings.motion, frames, generator)
+        self.motion = make_motion(settings.motion, frames, generator, start)
         self.scene = make_scene(settings, self.motion.scene_dimensions, channels, generator)
 
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from torch import Generator, Tensor, nn
 
 from napari_fiberburst import settings
 from napari_fiberburst.fields.layers import make_mlp, make_siren, zero_output
+from napari_fiberburst.geometry.frames import DEGREES_OF_FREEDOM, generators
 from napari_fiberburst.geometry.homography import apply, relative_to_first
 
 # A flow field is inverted to 1e-4 of half a frame: about 0.03 px of 600.
@@ -81,7 +82,7 @@ class StillField(MotionField):
 class HomographyField(MotionField):
     """M_t = g(t), 3x3 with bottom right element 1, from a ReLU network of time."""
 
-    def __init__(self, frames: int, choice: settings.Homography, generator: Generator) -> None:
+    def __init__(self, frames: int, choice: settings.HomographyNetwork, generator: Generator) -> None:
         super().__init__(frames)
         self.network = make_mlp([1, *[choice.motion_width] * choice.motion_layers, 8], generator)
         zero_output(self.network)
@@ -104,11 +105,51 @@ class HomographyField(MotionField):
         return apply(frame0_from_frame[frames], points)
 
 
-class FlowField(MotionField):
-    """(x + dx, y + dy) with (dx, dy) = g(x, y, t), a sine network."""
+class AlignedField(MotionField):
+    """One transform per frame, from where a registration has put it along the generators of its model.
 
-    def __init__(self, frames: int, choice: settings.Flow | settings.FlowTV, generator: Generator) -> None:
+    Parameters
+    ----------
+    start : Tensor
+        (T, 3, 3) homographies in unit coordinates.
+    freedom : int
+        How many generators move: 2 for shifts to 8 for homographies; 0 for none.
+    """
+
+    start: Tensor
+
+    def __init__(self, start: Tensor, freedom: int) -> None:
+        super().__init__(len(start))
+        self.register_buffer("start", start.clone())
+        self.register_buffer("generators", generators(freedom).to(start.dtype), persistent=False)
+        self.steps = nn.Parameter(torch.zeros(len(start), freedom))
+
+    def scene_from_frame(self) -> Tensor:
+        """Return exp(steps) start for every frame, (T, 3, 3)."""
+        change = torch.linalg.matrix_exp(torch.einsum("tk,kij->tij", self.steps, self.get_buffer("generators")))
+        scene_from_frame: Tensor = change @ self.start
+        return scene_from_frame
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): each point, transformed as its frame is."""
+        matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
+        return apply(matrices, points)
+
+
+class FlowField(MotionField):
+    """(x + dx, y + dy) with (dx, dy) = g(x, y, t), a sine network; (x, y) is first put where a registration says."""
+
+    start: Tensor | None
+
+    def __init__(
+        self,
+        frames: int,
+        choice: settings.Flow | settings.FlowTV,
+        generator: Generator,
+        start: Tensor | None = None,
+    ) -> None:
         super().__init__(frames)
+        self.register_buffer("start", start)
         widths = [3, *[choice.motion_width] * choice.motion_layers, 2]
         self.network = make_siren(widths, choice.flow_omega_0, generator)
         zero_output(self.network)
@@ -117,7 +158,11 @@ class FlowField(MotionField):
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return (N, 2): each point plus its displacement."""
         displacement: Tensor = self.network(self._places(points, frames))
-        return points + displacement
+        return displacement + (points if self.start is None else apply(self.start[frames], points))
+
+    def scene_from_frame(self) -> Tensor:
+        """Return where a registration has put the frames, (T, 3, 3); the identity without one."""
+        return super().scene_from_frame() if self.start is None else self.start
 
     def roughness(self, points: Tensor, frames: Tensor) -> Tensor | None:
         """Return the weighted mean absolute Jacobian of g over x, y and t."""
@@ -132,14 +177,33 @@ class FlowField(MotionField):
         return torch.cat([points, self.times[frames, None]], dim=1)
 
 
-def make_motion(choice: settings.Motion, frames: int, generator: Generator) -> MotionField:
-    """Build the motion field that the settings ask for; `generator` gives all random numbers, on the CPU."""
+def make_motion(choice: settings.Motion, frames: int, generator: Generator, start: Tensor | None = None) -> MotionField:
+    """Build the motion field that the settings ask for.
+
+    Parameters
+    ----------
+    choice : Motion
+        Which one.
+    frames : int
+        Length of the burst.
+    generator : torch.Generator
+        Source of all random numbers, on the CPU.
+    start : Tensor, optional
+        (T, 3, 3) homographies in unit coordinates, where a registration has put the frames. Without, all start at the
+        identity.
+    """
     match choice:
-        case settings.NoMotion():
-            return StillField(frames)
-        case settings.Homography():
-            return HomographyField(frames, choice, generator)
         case settings.Flow() | settings.FlowTV():
-            return FlowField(frames, choice, generator)
+            return FlowField(frames, choice, generator, start)
+        case settings.HomographyNetwork():
+            return HomographyField(frames, choice, generator)
+        case settings.NoMotion() if start is None:
+            return StillField(frames)
+        case settings.NoMotion() | settings.Translation() | settings.Similarity() | settings.Affine():
+            pass
+        case settings.Homography():
+            pass
         case _:
             assert_never(choice)
+    start = torch.eye(3).repeat(frames, 1, 1) if start is None else start
+    return AlignedField(start, DEGREES_OF_FREEDOM.get(choice.name, 0))

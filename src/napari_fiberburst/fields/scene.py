@@ -8,6 +8,8 @@ from napari_fiberburst import settings
 from napari_fiberburst.fields.encodings import Coordinates, HashGrid, Octaves, RandomFourier
 from napari_fiberburst.fields.layers import make_mlp, make_siren
 
+PUBLISHED_SIGMA = 5.0
+
 
 class SceneField(nn.Module):
     """f(gamma(p)): an encoding, then a network.
@@ -62,9 +64,11 @@ def make_scene(chosen: settings.Settings, dimensions: int, channels: int, genera
         case settings.NeRF(highest_octave=highest_octave):
             encoding = Octaves(dimensions, highest_octave)
         case settings.Fourier(features=features, sigma=sigma):
-            encoding = RandomFourier(dimensions, features, sigma, generator)
+            encoding = RandomFourier(dimensions, features, PUBLISHED_SIGMA if sigma is None else sigma, generator)
         case settings.Hash() as choice:
             encoding = HashGrid(dimensions, choice, generator)
+        case settings.Spline():
+            raise ValueError("a spline is solved, not trained: it is no network")
         case _:
             assert_never(chosen.encoding)
     widths = [encoding.width, *[chosen.scene_width] * chosen.scene_layers, channels]

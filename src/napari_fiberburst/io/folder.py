@@ -45,6 +45,22 @@ def read_pictures(paths: list[Path], source: str) -> Recording:
     return Recording(pixels=np.stack(frames), axes="TYX" if frames[0].ndim == 2 else "TYXC")
 
 
+def read_picture(path: str | Path) -> NDArray[Any]:
+    """Read one picture, (H, W) or (H, W, C), from a PNG, TIFF or npy file.
+
+    Raises
+    ------
+    BurstError
+        It is not there, or no picture.
+    """
+    file = Path(path)
+    if file.suffix.lower() == ".npy" and file.is_file():
+        return np.asarray(np.load(file))
+    if file.suffix.lower() not in PICTURE_ENDINGS or not file.is_file():
+        raise BurstError(f"expected a picture ending in {', '.join((*PICTURE_ENDINGS, '.npy'))}; got {path}")
+    return _read_png(file) if file.suffix.lower() == ".png" else _read_page(file)
+
+
 def _read_page(path: Path) -> NDArray[Any]:
     """Return the one frame of a TIFF file, (H, W) or (H, W, C)."""
     recording = read_tiff(path)

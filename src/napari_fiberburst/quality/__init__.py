@@ -2,5 +2,6 @@
 
 from napari_fiberburst.quality.motion import motion_error
 from napari_fiberburst.quality.picture import match_levels, psnr, ssim
+from napari_fiberburst.quality.resolution import RingCorrelation, ring_correlation
 
-__all__ = ["match_levels", "motion_error", "psnr", "ssim"]
+__all__ = ["RingCorrelation", "match_levels", "motion_error", "psnr", "ring_correlation", "ssim"]

@@ -18,15 +18,20 @@ def motion_error(homographies: NDArray[np.floating], truth: NDArray[np.floating]
     Parameters
     ----------
     homographies, truth : numpy.ndarray
-        (T, 3, 3), frame-t pixel to frame-0 pixel.
+        (T, 3, 3), frame-t pixel to frame-0 pixel. Frames whose homography holds NaN, left out for want of
+        registration, do not count.
     shape : (int, int)
         Height and width of a frame.
 
     Returns
     -------
     float
-        Mean distance in pixels, over the field and the frames.
+        Mean distance in pixels, over the field and the frames; NaN where no frame counts.
     """
+    known = np.isfinite(homographies).all(axis=(1, 2))
+    if not known.any():
+        return float("nan")
+    homographies, truth = np.asarray(homographies)[known], np.asarray(truth)[known]
     y, x = np.meshgrid(*(np.linspace(0, side - 1, _GRID) for side in shape), indexing="ij")
     points = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
     found, wanted = (_project(matrices, points) for matrices in (homographies, truth))

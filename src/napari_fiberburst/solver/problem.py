@@ -3,20 +3,31 @@
 from copy import deepcopy
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from napari_fiberburst.burst import Burst
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.fields import JointField
+from napari_fiberburst.fields.motion import AlignedField
+from napari_fiberburst.fields.scene import PUBLISHED_SIGMA
+from napari_fiberburst.geometry.coordinates import unit_from_pixel
 from napari_fiberburst.reconstruction import Reconstruction
-from napari_fiberburst.settings import Settings
+from napari_fiberburst.settings import Hash, Settings
+from napari_fiberburst.solver.alignment import Alignment
+from napari_fiberburst.solver.observed import ObservedSamples
 from napari_fiberburst.solver.representation import Representation
-from napari_fiberburst.solver.samples import Samples
+from napari_fiberburst.solver.samples import Batch, Samples
 
 # As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
 BATCHES_PER_FRAME = 8
 BETAS = (0.9, 0.999)
+_PUBLISHED_RATE = 1e-4
+# Behind a bundle model, and started from a registration, larger steps are safe. Grids learn each place by itself.
+_OBSERVED_RATE, _OBSERVED_RATE_OF_GRIDS = 1e-3, 1e-2
+# Motion that is right to a part of a pixel takes this part of the scene's step size.
+_PACE_OF_REGISTERED_MOTION = 0.01
 
 # What two bursts must share to be taken for one.
 _IDENTITY = ("shape", "axes", "dtype", "black_level", "white_level", "origin")
@@ -37,6 +48,8 @@ class Problem:
         Where.
     initial : Reconstruction, optional
         Where to go on from; the samples go on from where its run ended, too.
+    aligned : Alignment, optional
+        The burst, calibrated and registered; without, its frames are fitted as they are, as published.
 
     Raises
     ------
@@ -47,14 +60,31 @@ class Problem:
     # Whatever the caller's thread has set, the fit needs gradients, and tensors that can have them.
     @torch.inference_mode(False)
     def __init__(
-        self, burst: Burst, settings: Settings, device: torch.device, initial: Reconstruction | None = None
+        self,
+        burst: Burst,
+        settings: Settings,
+        device: torch.device,
+        initial: Reconstruction | None = None,
+        aligned: Alignment | None = None,
     ) -> None:
         count, height, width, channels = burst.shape
         self.frame_shape = (height, width)
-        self.batch = settings.batch or -(-height * width // BATCHES_PER_FRAME)
-        self.field = JointField(settings, count, channels).to(device)
-        self.optimizer = torch.optim.Adam(self.field.parameters(), lr=settings.learning_rate, betas=BETAS)
-        self.samples = Samples(burst, device, settings.seed)
+        self.samples: Samples | ObservedSamples
+        start = None
+        if aligned is None:
+            self.samples = Samples(burst, device, settings.seed)
+            self.batch = settings.batch or -(-height * width // BATCHES_PER_FRAME)
+        else:
+            self.samples = ObservedSamples(aligned, settings.held_out, settings.seed)
+            self.batch = min(settings.batch or -(-height * width // BATCHES_PER_FRAME), self.samples.count)
+            start = _unit_start(aligned)
+        self.field = JointField(settings, count, channels, start).to(device)
+        self.learning_rate = settings.learning_rate or _usual_rate(settings)
+        registered = isinstance(self.field.motion, AlignedField)
+        self._paces = (1.0, _PACE_OF_REGISTERED_MOTION if registered else 1.0)
+        parts = [{"params": part.parameters()} for part in (self.field.scene, self.field.motion)]
+        self.optimizer = torch.optim.Adam(parts, lr=self.learning_rate, betas=BETAS)
+        self.set_learning_rate(self.learning_rate)
         if initial is not None:
             self._go_on_from(initial, burst, settings)
 
@@ -63,9 +93,9 @@ class Problem:
         """Take one step of Adam on a fresh batch; return the loss before it, still on the device."""
         batch = self.samples.draw(self.batch)
         with torch.enable_grad():
-            predicted = self.field(batch.points, batch.frames)
-            loss: Tensor = (predicted - batch.intensities).square().mean()
-            roughness = self.field.motion.roughness(batch.points, batch.frames)
+            loss = self._misfit(batch)
+            points = batch.points if batch.points.ndim == 2 else batch.points[:, 0]
+            roughness = self.field.motion.roughness(points, batch.frames)
             if roughness is not None:
                 loss = loss + roughness
             self.optimizer.zero_grad()
@@ -73,10 +103,34 @@ class Problem:
         self.optimizer.step()
         return loss.detach()
 
+    def sample_error(self) -> float | None:
+        """Return the root mean square error, intensities in [0, 1], of samples that were left out; None without any."""
+        left_out = self.samples.left_out() if isinstance(self.samples, ObservedSamples) else None
+        if left_out is None:
+            return None
+        with torch.no_grad():
+            error: float = float(self._misfit(left_out)) ** 0.5 / 2
+        return error
+
+    def _misfit(self, batch: Batch) -> Tensor:
+        """Return the mean squared difference of the field and a batch."""
+        if batch.points.ndim == 2:
+            predicted = self.field(batch.points, batch.frames)
+        else:
+            count, each, _ = batch.points.shape
+            seen = self.field(batch.points.reshape(-1, 2), batch.frames.repeat_interleave(each))
+            predicted = seen.reshape(count, each, -1).mean(dim=1)
+        square = (predicted - batch.intensities).square()
+        if batch.weights is None:
+            mean: Tensor = square.mean()
+            return mean
+        weighted: Tensor = (square.mean(dim=1) * batch.weights).sum() / batch.weights.sum()
+        return weighted
+
     def set_learning_rate(self, learning_rate: float) -> None:
         """Change Adam's step size."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate
+        for group, pace in zip(self.optimizer.param_groups, self._paces, strict=True):
+            group["lr"] = pace * learning_rate
 
     def is_finite(self) -> bool:
         """Whether every parameter is a number. Waits for the device."""
@@ -115,7 +169,22 @@ class Problem:
             ) from error
         if start.optimizer_state is not None:
             self.optimizer.load_state_dict(deepcopy(start.optimizer_state))
-            self.set_learning_rate(settings.learning_rate)
+            self.set_learning_rate(self.learning_rate)
         if self.field.scene.has_sigma:
-            self.field.scene.set_sigma(settings.encoding.sigma)  # type: ignore[union-attr]
+            sigma = getattr(settings.encoding, "sigma", None)
+            self.field.scene.set_sigma(PUBLISHED_SIGMA if sigma is None else sigma)
         self.samples.drawn = start.drawn
+
+
+def _unit_start(aligned: Alignment) -> Tensor:
+    """Return where registration has put each frame, (T, 3, 3) in unit coordinates; the identity for unused frames."""
+    to_unit = unit_from_pixel(aligned.shape)
+    matrices = np.nan_to_num(aligned.homographies())
+    matrices[~aligned.used] = np.eye(3)
+    return torch.from_numpy((to_unit @ matrices @ np.linalg.inv(to_unit)).astype(np.float32))
+
+
+def _usual_rate(settings: Settings) -> float:
+    if settings.is_published:
+        return _PUBLISHED_RATE
+    return _OBSERVED_RATE_OF_GRIDS if isinstance(settings.encoding, Hash) else _OBSERVED_RATE

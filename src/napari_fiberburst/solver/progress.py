@@ -29,6 +29,9 @@ class Progress:
     preview : numpy.ndarray or None
         The picture as of now, in the burst's intensity units, (H, W) or (H, W, C) float32; None where this
         report has none.
+    sample_error : float or None
+        Root mean square by which samples that were left out of the fit are missed, in the burst's intensity units;
+        None while that is not known.
     """
 
     step: int
@@ -39,3 +42,4 @@ class Progress:
     remaining: float | None
     homographies: NDArray[np.float64]
     preview: NDArray[np.float32] | None = None
+    sample_error: float | None = None

@@ -16,12 +16,14 @@ from napari_fiberburst.geometry.coordinates import in_pixels, unit_from_pixel
 from napari_fiberburst.geometry.homography import relative_to_first
 from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.reconstruction import Canvas, Reconstruction, draw
-from napari_fiberburst.settings import Settings
+from napari_fiberburst.settings import Settings, Spline
 from napari_fiberburst.solver.device import find_device
+from napari_fiberburst.solver.picture import SplinePicture
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
 _CHUNK = 16_384
 _DRAWN = "samples_drawn"
+_BEHIND = "behind."
 
 
 class Representation:
@@ -37,6 +39,9 @@ class Representation:
         Adam's moments, to continue exactly; None starts them afresh.
     drawn : int
         Samples drawn so far.
+    behind : SplinePicture, optional
+        The first picture of a calibrated burst: it knows what no core has looked at, how frames lie, and what
+        intensity stands for no light.
     """
 
     def __init__(
@@ -45,7 +50,9 @@ class Representation:
         frame_shape: tuple[int, int],
         optimizer_state: dict[str, Any] | None = None,
         drawn: int = 0,
+        behind: SplinePicture | None = None,
     ) -> None:
+        self.behind = behind
         self.field = field
         self.frame_shape = frame_shape
         self.optimizer_state = optimizer_state
@@ -59,11 +66,12 @@ class Representation:
             shown: Tensor = self.field(unit, frames)
             return (shown + 1) / 2
 
-        return self._by_chunks(intensities, points, frame)
+        picture = self._by_chunks(intensities, points, frame)
+        return picture if self.behind is None else self.behind.masked(picture + self.behind.black, points, frame)
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
         """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
-        if frame == 0:
+        if frame == 0 and self.behind is None:
             return np.zeros_like(points)
 
         def moves(unit: Tensor, frames: Tensor) -> Tensor:
@@ -72,15 +80,22 @@ class Representation:
         return self._by_chunks(moves, points, frame) / np.diag(self._unit_from_pixel)[:2]
 
     def homographies(self) -> NDArray[np.float64]:
-        """Return (T, 3, 3), frame-t pixel to frame-0 pixel."""
+        """Return (T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that were left out."""
         with torch.no_grad():
             scene_from_frame = self.field.motion.scene_from_frame().cpu().numpy().astype(np.float64)
-        return relative_to_first(in_pixels(scene_from_frame, self.frame_shape))
+        reference = 0 if self.behind is None else self.behind.reference
+        order = [reference, *(frame for frame in range(len(scene_from_frame)) if frame != reference)]
+        relative = np.empty_like(scene_from_frame)
+        relative[order] = relative_to_first(in_pixels(scene_from_frame[order], self.frame_shape))
+        if self.behind is not None:
+            relative[~self.behind.used] = np.nan
+        return relative
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the fitted parameters, the random frequencies and the samples drawn, by name."""
         parameters = {name: value.cpu().numpy() for name, value in self.field.state_dict().items()}
-        return {**parameters, _DRAWN: np.array(self.drawn)}
+        behind = {} if self.behind is None else self.behind.arrays()
+        return {**parameters, _DRAWN: np.array(self.drawn), **{_BEHIND + name: part for name, part in behind.items()}}
 
     def _by_chunks(
         self, function: Callable[[Tensor, Tensor], Tensor], points: NDArray[np.float64], frame: int
@@ -130,22 +145,49 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
 def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
     settings = Settings.from_dict(provenance["settings"])
     acquisition = Acquisition.from_dict(provenance["burst"])
-    count, height, width, channels = acquisition.shape
-    drawn = int(arrays.pop(_DRAWN))
-    field = JointField(settings, count, channels)
-    field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    representation = Representation(field.to(device), (height, width), drawn=drawn)
-    canvas = Canvas.over((0, 0, width, height))
+    canvas = Canvas(
+        shape=tuple(provenance["canvas"]["shape"]),
+        frame0_from_image=np.array(provenance["canvas"]["frame0_from_image"]),
+    )
+    reference = int(provenance.get("reference", 0))
+    renderer: SplinePicture | Representation
+    if isinstance(settings.encoding, Spline):
+        renderer = SplinePicture.from_arrays(arrays, device)
+        homographies = renderer.homographies
+    else:
+        renderer = _rebuild_networks(arrays, settings, acquisition, device)
+        homographies = renderer.homographies()
     return Reconstruction(
-        image=draw(representation, canvas, 0, acquisition),
+        image=draw(renderer, canvas, reference, acquisition),
         canvas=canvas,
-        homographies=representation.homographies(),
-        losses=np.array(provenance["losses"], dtype=np.float32),
+        homographies=homographies,
+        losses=np.array([np.nan if loss is None else loss for loss in provenance["losses"]], dtype=np.float32),
         settings=settings,
         seconds=float(provenance["seconds"]),
-        parameters=field.parameter_count,
+        parameters=int(provenance["parameters"]),
         device=str(device),
         ending=provenance["ending"],
         acquisition=acquisition,
-        renderer=representation,
+        renderer=renderer,
+        reference=reference,
+        sample_error=provenance.get("sample_error"),
+        frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
+        confidence=None
+        if provenance.get("confidence") is None
+        else np.array(provenance["confidence"], dtype=np.float64),
+        resolution=provenance.get("resolution"),
+        notes=tuple(provenance.get("notes", ())),
     )
+
+
+def _rebuild_networks(
+    arrays: dict[str, NDArray[Any]], settings: Settings, acquisition: Acquisition, device: torch.device
+) -> Representation:
+    count, height, width, channels = acquisition.shape
+    drawn = int(arrays.pop(_DRAWN))
+    kept = {name.removeprefix(_BEHIND): arrays.pop(name) for name in list(arrays) if name.startswith(_BEHIND)}
+    start = None if settings.is_published else torch.eye(3).repeat(count, 1, 1)
+    field = JointField(settings, count, channels, start)
+    field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    behind = SplinePicture.from_arrays(kept, device) if kept else None
+    return Representation(field.to(device), (height, width), drawn=drawn, behind=behind)

@@ -17,6 +17,8 @@ from napari_fiberburst.settings import Fourier, Settings
 from napari_fiberburst.solver.device import find_device
 from napari_fiberburst.solver.problem import Problem, State
 from napari_fiberburst.solver.progress import Progress
+from napari_fiberburst.solver.representation import Representation
+from napari_fiberburst.solver.selfcalibrated import SelfCalibrated
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +26,9 @@ logger = logging.getLogger(__name__)
 _SECONDS_BETWEEN_REPORTS = 0.1
 # Keeping a state copies the networks and Adam's moments.
 _SECONDS_BETWEEN_KEPT_STATES = 1.0
+_PUBLISHED_ITERATIONS, _OBSERVED_ITERATIONS = 3000, 2000
+# Without an end of its own, a fit ends once the samples left out have not been met better for this part of its steps.
+_PATIENCE, _LEAST_PATIENCE = 0.4, 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +47,8 @@ class Run:
     ----------
     burst, settings, initial
         As in `napari_fiberburst.iterate`.
+    prepared : SelfCalibrated, optional
+        The burst, calibrated and registered, with a first picture; without, it is fitted as published.
 
     Attributes
     ----------
@@ -51,22 +58,34 @@ class Run:
         Why the run ended, once it has.
     """
 
-    def __init__(self, burst: Burst, settings: Settings, initial: Reconstruction | None) -> None:
+    def __init__(
+        self,
+        burst: Burst,
+        settings: Settings,
+        initial: Reconstruction | None,
+        prepared: SelfCalibrated | None = None,
+    ) -> None:
         self._burst = burst
         self._settings = settings
         self._initial = initial
+        self._prepared = prepared
         self._device = find_device(settings.device)
-        self._problem = Problem(burst, settings, self._device, initial)
-        self._canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]))
+        aligned = None if prepared is None else prepared.alignment
+        self._problem = Problem(burst, settings, self._device, initial, aligned)
+        self._settings = replace(settings, learning_rate=self._problem.learning_rate)
+        bounds = (0, 0, burst.shape[2], burst.shape[1])
+        self._canvas = Canvas.over(bounds, settings.upsample) if prepared is None else prepared.canvas
+        self.iterations = settings.iterations or (_OBSERVED_ITERATIONS if prepared else _PUBLISHED_ITERATIONS)
+        self._best: tuple[float, _Kept] | None = None
         self._losses: list[float] = []
         self._pending: list[Tensor] = []
-        self._kept: tuple[_Kept, ...] = (_Kept(0, settings, self._problem.state()),)
+        self._kept: tuple[_Kept, ...] = (_Kept(0, self._settings, self._problem.state()),)
         self._live_sigma: float | None = None
         self._first_done = self._reported = self._previewed = self._kept_at = 0.0
         self.step = 0
         self.ending: Ending = "finished"
         # The first set-up in a process loads much of torch, which is not the run's to answer for.
-        self._started = time.perf_counter()
+        self._started = time.perf_counter() - (0.0 if prepared is None else prepared.seconds)
 
     @property
     def seconds(self) -> float:
@@ -110,7 +129,7 @@ class Run:
     def is_report_due(self) -> bool:
         """Whether it is time to look; the last step is reported at the end."""
         due = self.step == 1 or self.seconds - self._reported >= _SECONDS_BETWEEN_REPORTS
-        return due and self.step < self._settings.iterations
+        return due and self.step < self.iterations
 
     def is_healthy(self) -> bool:
         """Whether all losses and all parameters are numbers; else go back to when they were."""
@@ -125,8 +144,21 @@ class Run:
         self._go_back()
         return False
 
+    def has_converged(self) -> bool:
+        """Look at the samples that were left out, and whether they have stopped being met better."""
+        error = self._problem.sample_error()
+        if error is None:
+            return False
+        if self._best is None or error < self._best[0]:
+            self._best = (error, _Kept(self.step, self._settings, self._problem.state()))
+        waited = self.step - self._best[1].step
+        return self._settings.iterations is None and waited > max(_LEAST_PATIENCE, _PATIENCE * self.step)
+
     def finish(self) -> None:
-        """Make sure that what is there can be drawn, by going back where it cannot."""
+        """Take the state that meets the samples left out best, and make sure that it can be drawn."""
+        if self._best is not None and self.ending != "diverged":
+            self.has_converged()
+            self._problem.restore(self._best[1].state)
         if self.ending != "diverged" and self.is_healthy():
             self._image = self._picture()
             if np.isfinite(self._image).all():
@@ -145,18 +177,19 @@ class Run:
         rate = (self.step - 1) / (now - self._first_done) if self.step > 1 else 0.0
         return Progress(
             step=self.step,
-            iterations=settings.iterations,
+            iterations=self.iterations,
             loss=self._losses[-1],
             seconds=now,
             rate=rate,
             remaining=0.0 if last else self._remaining(rate, now),
-            homographies=self._problem.representation().homographies(),
+            homographies=self._representation().homographies(),
             preview=preview,
+            sample_error=self._error_in_units(),
         )
 
     def result(self) -> Reconstruction:
         """Return what the run has come to."""
-        representation = self._problem.representation()
+        representation = self._representation()
         losses = np.array(self._losses, dtype=np.float32)
         before = self._initial
         return Reconstruction(
@@ -171,13 +204,23 @@ class Run:
             ending=self.ending,
             acquisition=self._burst.acquisition,
             renderer=representation,
+            sample_error=self._error_in_units(),
+            **({} if self._prepared is None else self._prepared.bundle_evidence()),
         )
+
+    def _error_in_units(self) -> float | None:
+        return None if self._best is None else self._best[0] * (self._burst.white_level - self._burst.black_level)
+
+    def _representation(self) -> Representation:
+        representation = self._problem.representation()
+        representation.behind = None if self._prepared is None else self._prepared.picture
+        return representation
 
     def _remaining(self, rate: float, now: float) -> float | None:
         budget = self._settings.time_budget
         limits = [] if budget is None else [max(0.0, budget - now)]
         if rate > 0:
-            limits.append((self._settings.iterations - self.step) / rate)
+            limits.append((self.iterations - self.step) / rate)
         return min(limits, default=None)
 
     def _go_back(self) -> None:
@@ -193,7 +236,7 @@ class Run:
             "the fit stopped giving numbers by step %d; going back to step %d; a learning rate lower than %g may help",
             self.step,
             back.step,
-            self._settings.learning_rate,
+            self._settings.learning_rate or 0.0,
         )
         self._problem.restore(back.state)
         self._settings = back.settings
@@ -202,4 +245,5 @@ class Run:
         self.ending = "diverged"
 
     def _picture(self) -> NDArray[np.float32]:
-        return draw(self._problem.representation(), self._canvas, 0, self._burst)
+        reference = 0 if self._prepared is None else self._prepared.alignment.reference
+        return draw(self._representation(), self._canvas, reference, self._burst)

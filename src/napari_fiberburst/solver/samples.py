@@ -23,11 +23,18 @@ class Batch(NamedTuple):
         (N,) frame numbers.
     intensities : Tensor
         (N, C) in [-1, 1].
+    weights : Tensor or None
+        (N,) how much each counts; None where all count the same.
+
+    Notes
+    -----
+    Behind a bundle, points are (N, K, 2): K points of a sensor's footprint, of which it sees the mean.
     """
 
     points: Tensor
     frames: Tensor
     intensities: Tensor
+    weights: Tensor | None = None
 
 
 class Samples:
@@ -71,13 +78,15 @@ class Samples:
         while count:
             epoch, position = divmod(self.drawn, self._total)
             if epoch != self._epoch:
-                self._order = self._shuffle(epoch)
+                self._order = shuffled(self._total, self._seed, epoch, self._device)
                 self._epoch = epoch
             part = self._order[position : position + count]
             self.drawn += len(part)
             count -= len(part)
             yield part
 
-    def _shuffle(self, epoch: int) -> Tensor:
-        generator = torch.Generator(self._device).manual_seed(self._seed + _SEED_STRIDE * epoch)
-        return torch.randperm(self._total, generator=generator, device=self._device)
+
+def shuffled(count: int, seed: int, epoch: int, device: torch.device) -> Tensor:
+    """Return the numbers up to `count` in the order of an epoch."""
+    generator = torch.Generator(device).manual_seed(seed + _SEED_STRIDE * epoch)
+    return torch.randperm(count, generator=generator, device=device)
