@@ -65,7 +65,7 @@ from napari_fiberburst.choices import (
     Translation as Translation,
 )
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.knobs import check, knob, knobs_of
+from napari_fiberburst.knobs import Knob, check, knob, knobs_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +120,9 @@ class Settings:
         None, "Seconds after which to stop with what there is; None for no limit.", above=0
     )
     preview_every: float | None = knob(
-        None, "Seconds between preview pictures while fitting; None makes none.", above=0
+        None,
+        "Seconds between preview pictures while fitting, or more where drawing would slow the fit; None makes none.",
+        above=0,
     )
 
     def __post_init__(self) -> None:
@@ -149,6 +151,19 @@ class Settings:
     def motions(self) -> Mapping[str, type[Motion]]:
         """The motions that go with the observation, by name."""
         return PUBLISHED_MOTIONS if self.is_published else MOTIONS
+
+    @property
+    def knobs(self) -> dict[str, Knob]:
+        """The knobs that turn something with this motion, encoding and observation, by name."""
+        own = knobs_of(Settings)
+        if isinstance(self.encoding, Spline):
+            idle = {"scene_layers", "scene_width", "learning_rate", "batch"}
+        elif self.is_published:
+            idle = {"canvas", "fill", "held_out"}
+        else:
+            idle = set()
+        used = {name: knob for name, knob in own.items() if name not in idle}
+        return {**knobs_of(type(self.motion)), **knobs_of(type(self.encoding)), **used}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values that JSON can hold; `from_dict` reads them back."""

@@ -166,8 +166,9 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path):
         "import time; from napari_fiberburst import Control\n"
         "from napari_fiberburst.cli.reconstruct import stop_on_interrupt\n"
         "with stop_on_interrupt(Control()):\n"
-        "    print('running', flush=True)\n"
-        "    try: time.sleep(60)\n"
+        "    try:\n"
+        "        print('running', flush=True)\n"
+        "        time.sleep(60)\n"
         "    except KeyboardInterrupt: print('ended', flush=True)\n"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

@@ -181,7 +181,7 @@ def test_networks_run_on_the_same_samples(encoding):
 def test_a_network_ends_where_it_stops_meeting_unseen_samples_better(monkeypatch):
     simulated = simulate("cat", shape=(67, 81), frames=6, pitch=5.0, physics="core", seed=2)
     monkeypatch.setattr("napari_fiberburst.solver.run._LEAST_PATIENCE", 20)
-    result = reconstruct(simulated.burst, encoding="hash", scene_width=16, scene_layers=1, batch=2048, levels=8)
+    result = reconstruct(simulated.burst, encoding="hash", scene_width=16, scene_layers=1, batch=256, levels=8)
     assert result.ending == "finished"
     assert len(result.losses) < 2000
     # It overfits later: the last losses are lower than those of the state that was kept.
@@ -451,3 +451,13 @@ def test_bad_calls_are_refused(cores, choices, error, said):
 def test_a_spline_has_nothing_to_continue(cores, fitted):
     with pytest.raises(SettingsError, match="nothing to continue"):
         reconstruct(cores.burst, initial=fitted)
+
+
+def test_progress_tells_what_was_chosen(tiny_burst):
+    reports = []
+    small = {"scene_width": 8, "scene_layers": 1, "features": 8, "iterations": 3}
+    result = reconstruct(tiny_burst, encoding="fourier", **small, on_progress=reports.append)
+    assert reports[0].settings.encoding.sigma is None
+    assert reports[-1].settings == result.settings
+    assert result.settings.encoding.sigma > 0
+    assert reports[-1].canvas.shape == result.canvas.shape

@@ -103,6 +103,44 @@ def write_representation(path: str | Path, arrays: Mapping[str, NDArray[Any]], p
     return target
 
 
+def write_homographies(path: str | Path, homographies: NDArray[np.float64]) -> Path:
+    """Write homographies as a table or as JSON.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.csv``: a line per frame, its number and the matrix row by row; ``.json``: the number of each frame with its
+        3x3 matrix. Frames without a homography have nan in CSV and null in JSON.
+    homographies : numpy.ndarray
+        (T, 3, 3), frame-t pixel (x, y) to frame-0 pixel.
+
+    Raises
+    ------
+    OutputError
+        The folder does not exist or cannot be written, or the ending is neither of these.
+    """
+    target = Path(path)
+    ending = target.suffix.lower()
+    if ending == ".csv":
+        head = "frame," + ",".join(f"h{row}{column}" for row in range(3) for column in range(3))
+        lines = [
+            f"{frame}," + ",".join(map(repr, matrix.ravel().tolist())) for frame, matrix in enumerate(homographies)
+        ]
+        text = "\n".join([head, *lines]) + "\n"
+    elif ending == ".json":
+        frames = [
+            {"frame": frame, "homography": matrix.tolist() if np.isfinite(matrix).all() else None}
+            for frame, matrix in enumerate(homographies)
+        ]
+        document = {**_versions(), "maps": "frame-t pixel (x, y) to frame-0 pixel (x, y)", "frames": frames}
+        text = json.dumps(document, indent=1, allow_nan=False)
+    else:
+        raise OutputError(f"homographies are written to a file ending in .csv or .json; got {target}")
+    with write_whole(target) as stream:
+        stream.write(text.encode())
+    return target
+
+
 def read_representation(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Read what `write_representation` wrote.
 

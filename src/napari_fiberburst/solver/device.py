@@ -21,6 +21,27 @@ def find_device(name: str) -> torch.device:
     raise DeviceError(f"device {name!r} is not on this machine; there are auto, {', '.join(here)}")
 
 
+def missing_devices() -> dict[str, str]:
+    """Return the kinds of device that are not on this machine, each with the reason and what would help."""
+    here = _available()
+    missing = {}
+    if not any(name.startswith("cuda") for name in here):
+        missing["cuda"] = (
+            "this build of PyTorch is for the CPU alone; https://pytorch.org/get-started/locally/ has one with CUDA"
+            if torch.version.cuda is None
+            else f"PyTorch is built for CUDA {torch.version.cuda}, but finds no NVIDIA GPU with a driver for it"
+        )
+    if "mps" not in here:
+        missing["mps"] = "only Apple computers with an Apple GPU have it, from macOS 12.3 on"
+    return missing
+
+
+def free_memory(name: str) -> int | None:
+    """Return how many bytes are free on the device called `name`; None where it uses the machine's own memory."""
+    device = find_device(name)
+    return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None
+
+
 def _available() -> list[str]:
     """Return the names of this machine's devices, fastest kind first."""
     cuda = [f"cuda:{index}" for index in range(torch.cuda.device_count())] if torch.cuda.is_available() else []

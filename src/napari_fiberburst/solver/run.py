@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 # Reports make the host wait for the device, so there are few of them, and more would not be seen.
 _SECONDS_BETWEEN_REPORTS = 0.1
+# Drawing a picture asks the network for every pixel: watching must not slow a fit that is watched.
+_PREVIEWS_SHARE = 0.05
 # Keeping a state copies the networks and Adam's moments.
 _SECONDS_BETWEEN_KEPT_STATES = 1.0
 _PUBLISHED_ITERATIONS, _OBSERVED_ITERATIONS = 3000, 2000
@@ -81,7 +83,7 @@ class Run:
         self._pending: list[Tensor] = []
         self._kept: tuple[_Kept, ...] = (_Kept(0, self._settings, self._problem.state()),)
         self._live_sigma: float | None = None
-        self._first_done = self._reported = self._previewed = self._kept_at = 0.0
+        self._first_done = self._reported = self._previewed = self._drawing = self._kept_at = 0.0
         self.step = 0
         self.ending: Ending = "finished"
         # The first set-up in a process loads much of torch, which is not the run's to answer for.
@@ -170,9 +172,10 @@ class Run:
         """Return where the run stands."""
         settings = self._settings
         preview = self._image if last and settings.preview_every is not None else None
-        if not last and settings.preview_every is not None and self.seconds - self._previewed >= settings.preview_every:
+        if not last and self._is_preview_due():
+            drawing = self.seconds
             preview = self._picture()
-            self._previewed = self.seconds
+            self._previewed, self._drawing = self.seconds, self.seconds - drawing
         now = self._reported = self.seconds
         rate = (self.step - 1) / (now - self._first_done) if self.step > 1 else 0.0
         return Progress(
@@ -183,9 +186,15 @@ class Run:
             rate=rate,
             remaining=0.0 if last else self._remaining(rate, now),
             homographies=self._representation().homographies(),
+            settings=settings,
+            canvas=self._canvas,
             preview=preview,
             sample_error=self._error_in_units(),
         )
+
+    def _is_preview_due(self) -> bool:
+        wanted = self._settings.preview_every
+        return wanted is not None and self.seconds - self._previewed >= max(wanted, self._drawing / _PREVIEWS_SHARE)
 
     def result(self) -> Reconstruction:
         """Return what the run has come to."""

@@ -229,6 +229,8 @@ class SelfCalibrated:
             rate=rate,
             remaining=(total - step) / rate,
             homographies=aligned.homographies(),
+            settings=self._chosen_settings,
+            canvas=self.canvas,
             preview=self._fresh_preview(last=last),
             sample_error=self._error_in_units,
         )
@@ -245,6 +247,13 @@ class SelfCalibrated:
         return draw(picture, self.canvas, self.alignment.reference, self._burst)
 
     @property
+    def _chosen_settings(self) -> Settings:
+        settings = self._settings
+        if isinstance(settings.encoding, Spline) and self._smoothness is not None:
+            return replace(settings, encoding=Spline(smoothness=self._smoothness))
+        return settings
+
+    @property
     def _error_in_units(self) -> float | None:
         return None if self._error is None else self._error * (self._burst.white_level - self._burst.black_level)
 
@@ -252,15 +261,12 @@ class SelfCalibrated:
         """Return the reconstruction, as far as it has come."""
         assert self.picture is not None
         assert self._normal is not None
-        settings = self._settings
-        if isinstance(settings.encoding, Spline) and self._smoothness is not None:
-            settings = replace(settings, encoding=Spline(smoothness=self._smoothness))
         return Reconstruction(
             image=self._draw(self.picture),
             canvas=self.canvas,
             homographies=self.alignment.homographies(),
             losses=np.array(self._losses, dtype=np.float32),
-            settings=settings,
+            settings=self._chosen_settings,
             seconds=self.seconds,
             parameters=self.picture.parameters,
             device=str(self._device),
