@@ -1,8 +1,11 @@
 """Before the tests: load what rests on libraries of the system, and name the package of one that is missing."""
 
+import ctypes
 import importlib
 import importlib.util
+import os
 import re
+import shutil
 import sys
 
 # Which of Debian's packages brings a library that wheels leave to the system.
@@ -19,6 +22,18 @@ DEBIAN_PACKAGES = {
     "libglib-2.0.so.0": "libglib2.0-0",
 }
 QT_BINDINGS = ("PyQt6", "PySide6")
+# What Qt's window on X11 loads only when it opens, and then ends the program for want of.
+X11_PACKAGES = {
+    "libxcb-cursor.so.0": "libxcb-cursor0",
+    "libxcb-icccm.so.4": "libxcb-icccm4",
+    "libxcb-image.so.0": "libxcb-image0",
+    "libxcb-keysyms.so.1": "libxcb-keysyms1",
+    "libxcb-render-util.so.0": "libxcb-render-util0",
+    "libxcb-shape.so.0": "libxcb-shape0",
+    "libxcb-xinerama.so.0": "libxcb-xinerama0",
+    "libxcb-xkb.so.1": "libxcb-xkb1",
+    "libxkbcommon-x11.so.0": "libxkbcommon-x11-0",
+}
 
 
 def advice(error: ImportError) -> str:
@@ -39,6 +54,21 @@ def modules() -> list[str]:
     return ["torch", "skimage.metrics", *(f"{name}.QtWidgets" for name in bindings)]
 
 
+def missing_for_windows() -> list[str]:
+    """Return the packages that a window needs and this machine lacks; X11 stands for a display on Linux alone."""
+    if not sys.platform.startswith("linux"):
+        return []
+    missing = []
+    for library, package in X11_PACKAGES.items():
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            missing.append(package)
+    if shutil.which("Xvfb") is None and "DISPLAY" not in os.environ:
+        missing.append("xvfb")
+    return missing
+
+
 def main() -> int:
     """Load everything; return 1 with advice where something does not load."""
     for name in modules():
@@ -47,6 +77,13 @@ def main() -> int:
         except ImportError as error:
             sys.stderr.write(f"{name} does not load: {advice(error)}\n")
             return 1
+    missing = missing_for_windows()
+    if missing:
+        sys.stderr.write(
+            "the plugin's tests open windows, and lack what those need;\n"
+            f"on Debian or Ubuntu: sudo apt-get install {' '.join(missing)}\n"
+        )
+        return 1
     return 0
 
 

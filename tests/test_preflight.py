@@ -15,5 +15,10 @@ def test_an_unknown_library_says_how_to_find_it():
     assert "apt-file search libodd.so.3" in PREFLIGHT["advice"](ImportError("libodd.so.3: cannot open"))
 
 
+def test_ci_installs_all_that_is_named():
+    listed = set(Path(__file__).parents[1].joinpath(".ci/apt-packages").read_text().split())
+    assert set(PREFLIGHT["X11_PACKAGES"].values()) <= listed
+
+
 def test_all_loads_here():
     assert PREFLIGHT["main"]() == 0

@@ -1,0 +1,267 @@
+"""From napari's layers to a burst: which axis is which, what is known of the pixels, and where the truth lies."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import tifffile
+from napari.layers import Image, Shapes
+from numpy.typing import NDArray
+
+from napari_fiberburst.burst import MIN_SIDE, Burst
+from napari_fiberburst.errors import BurstError, FiberBurstError
+from napari_fiberburst.io.tiff import TIFF_ENDINGS
+from napari_fiberburst.plugin import METADATA_KEY
+
+_LABELS = {"t": "T", "time": "T", "frame": "T", "c": "C", "channel": "C", "y": "Y", "x": "X", "z": "Z"}
+_PIXEL_UNITS = ("pixel", "dimensionless")
+Region = tuple[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """What a simulated burst knows of itself.
+
+    Attributes
+    ----------
+    picture : numpy.ndarray
+        (H, W, C) float32 in [0, 1], frame 0 without bundle and noise.
+    homographies : numpy.ndarray
+        (T, 3, 3), frame-t pixel to frame-0 pixel.
+    """
+
+    picture: NDArray[np.float32]
+    homographies: NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BurstSource:
+    """A burst as the layers hold it; nothing is copied or computed until `read`.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The layers.
+    arrays : tuple of array
+        Their data, numpy or dask.
+    axes : str
+        Order of the axes of each array, such as "TYX", "TYXC" or "CTYX".
+    region : ((int, int), (int, int)) or None
+        Rows and columns, half-open, of the part that is used.
+    pixel_size : (float, float) or None
+        Height and width of a pixel, in `unit`.
+    unit : str or None
+        Unit of length.
+    words : tuple of str
+        How each array is called in napari's console.
+    path : str or None
+        The file that holds it just as it is.
+    recipe : dict
+        How a simulated burst was made; empty for others.
+    truth : Truth or None
+        Of the whole frame.
+    """
+
+    names: tuple[str, ...]
+    arrays: tuple[Any, ...]
+    axes: str
+    region: Region | None = None
+    pixel_size: tuple[float, float] | None = None
+    unit: str | None = None
+    words: tuple[str, ...]
+    path: str | None = None
+    recipe: dict[str, Any]
+    truth: Truth | None = None
+
+    @property
+    def name(self) -> str:
+        """The layers' names in one."""
+        return " + ".join(self.names)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(T, H, W, C) of the burst, by the axes given.
+
+        Raises
+        ------
+        BurstError
+            The axes do not fit the data, or there is no axis of frames.
+        """
+        data = self.arrays[0]
+        if len(self.axes) != data.ndim or len(set(self.axes)) != data.ndim or not {"T", "Y", "X"} <= set(self.axes):
+            raise BurstError(
+                f"a burst needs the axes T, Y, X and perhaps C; layer {self.names[0]!r} has shape "
+                f"{tuple(data.shape)} with axes {self.axes or 'unknown'}; open the frames as one stack, or correct "
+                "the order of the axes"
+            )
+        sizes = dict(zip(self.axes, data.shape, strict=True))
+        long = [axis for axis, size in sizes.items() if axis not in "TYXC" and size != 1]
+        if long:
+            raise BurstError(
+                f"axis {long[0]} of {self.axes} must have length 1, got {sizes[long[0]]}; take one position of it, or "
+                "call it T or C"
+            )
+        height, width = (
+            (stop - start for start, stop in self.region) if self.region is not None else (sizes["Y"], sizes["X"])
+        )
+        return sizes["T"], height, width, sizes.get("C", 1) if len(self.arrays) == 1 else len(self.arrays)
+
+    @property
+    def frames(self) -> Any:
+        """The burst as it came, (T, H, W) or (T, H, W, C), the region alone; lazy where the layer's data are."""
+        axes, data = self.axes, self.arrays[0]
+        if len(self.arrays) > 1:
+            axes, data = axes + "C", np.stack(self.arrays, axis=-1)
+        for axis in [axis for axis in axes if axis not in "TYXC"]:
+            data, axes = data[(slice(None),) * axes.index(axis) + (0,)], axes.replace(axis, "")
+        data = data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
+        if self.region is None:
+            return data
+        (y0, y1), (x0, x1) = self.region
+        return data[:, y0:y1, x0:x1]
+
+    def read(self) -> Burst:
+        """Make the burst; may take as long as reading the file does.
+
+        Raises
+        ------
+        BurstError
+            The layers are no usable burst.
+        """
+        axes, data = self.axes, self.arrays[0]
+        if len(self.arrays) > 1:
+            if "C" in axes or any(array.shape != data.shape for array in self.arrays):
+                raise BurstError(
+                    "layers that are channels of one burst must be grey and of one shape; got "
+                    + ", ".join(f"{name} {tuple(array.shape)}" for name, array in self._named())
+                )
+            axes, data = axes + "C", np.stack([np.asarray(array) for array in self.arrays], axis=-1)
+        burst = Burst(
+            data,
+            axes=axes,
+            channel_names=self.names if len(self.arrays) > 1 else (),
+            pixel_size=self.pixel_size,
+            unit=self.unit,
+        )
+        return burst if self.region is None else burst.crop(*self.region)
+
+    def _named(self) -> list[tuple[str, Any]]:
+        return list(zip(self.names, self.arrays, strict=True))
+
+
+def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) -> BurstSource:
+    """Describe the burst that lies in one layer, or in one layer for each channel."""
+    first = layers[0]
+    told = first.metadata.get(METADATA_KEY, {}) if len(layers) == 1 else {}
+    truth = _truth(told, _data(first), axes)
+    pixel_size, unit = _pixel_size(first, axes)
+    return BurstSource(
+        names=tuple(layer.name for layer in layers),
+        arrays=tuple(_data(layer) for layer in layers),
+        axes=axes,
+        region=region,
+        pixel_size=pixel_size,
+        unit=unit,
+        words=tuple(_words(layer) for layer in layers),
+        path=_path(first, told) if len(layers) == 1 else None,
+        recipe={} if truth is None else dict(told.get("recipe", {})),
+        truth=truth,
+    )
+
+
+def guess_axes(layer: Image) -> str:
+    """Return the order of a layer's axes, a letter each, by its labels or else by its shape."""
+    data = _data(layer)
+    labels = [_LABELS.get(label.lower(), "") for label in layer.axis_labels]
+    if layer.rgb:
+        return "TYXC"[-data.ndim :] if data.ndim <= 4 else "Q" * (data.ndim - 4) + "TYXC"
+    if all(labels) and {"T", "Y", "X"} <= set(labels) and len(set(labels)) == data.ndim:
+        return "".join(labels)
+    if data.ndim != 4:
+        # Axes of length 1 in front, as ImageJ's stacks have them, are dropped when the burst is read.
+        return "QZTYX"[-data.ndim :] if data.ndim <= 5 else ""
+    if data.shape[3] < MIN_SIDE:
+        return "TYXC"
+    return "TCYX" if data.shape[0] >= data.shape[1] else "CTYX"
+
+
+def region_of(shapes: Shapes, burst: Image, axes: str) -> Region:
+    """Return rows and columns of the burst inside the rectangle that is selected, or drawn last.
+
+    Raises
+    ------
+    FiberBurstError
+        There is no shape, or it lies outside the frame, or is too small.
+    """
+    if not len(shapes.data):
+        raise FiberBurstError(f"layer {shapes.name!r} holds no rectangle; draw one, or choose no region")
+    if axes.replace("C", "" if burst.rgb else "C")[-2:] != "YX":
+        raise FiberBurstError("a region needs the burst's last two axes to be Y and X; choose no region")
+    chosen = max(shapes.selected_data, default=len(shapes.data) - 1)
+    corners = np.array([shapes.data_to_world(vertex)[-2:] for vertex in shapes.data[chosen]])
+    inside = np.array([burst.world_to_data((*[0.0] * (burst.ndim - 2), *corner))[-2:] for corner in corners])
+    sizes = dict(zip(axes, _data(burst).shape, strict=True))
+    (y0, x0), (y1, x1) = np.rint(inside.min(axis=0)).astype(int), np.rint(inside.max(axis=0)).astype(int) + 1
+    rows, columns = (max(y0, 0), min(y1, sizes["Y"])), (max(x0, 0), min(x1, sizes["X"]))
+    if min(rows[1] - rows[0], columns[1] - columns[0]) < MIN_SIDE:
+        raise FiberBurstError(
+            f"the region must cover at least {MIN_SIDE} x {MIN_SIDE} pixels of the frame; it covers rows "
+            f"{rows[0]} to {rows[1]} and columns {columns[0]} to {columns[1]}; draw a larger rectangle"
+        )
+    return (int(rows[0]), int(rows[1])), (int(columns[0]), int(columns[1]))
+
+
+def _data(layer: Image) -> Any:
+    """Return a layer's array at full resolution, without the alpha channel of an RGBA picture."""
+    data = layer.data[0] if layer.multiscale else layer.data
+    return data[..., :3] if layer.rgb and data.shape[-1] == 4 else data
+
+
+def _pixel_size(layer: Image, axes: str) -> tuple[tuple[float, float] | None, str | None]:
+    """Return height and width of a pixel and their unit, where the layer has a unit of length."""
+    spatial = axes.replace("C", "") if layer.rgb else axes
+    if not {"Y", "X"} <= set(spatial) or len(spatial) != layer.ndim:
+        return None, None
+    at = [spatial.index(axis) for axis in "YX"]
+    units = {str(layer.units[axis]) for axis in at}
+    if len(units) != 1 or units & set(_PIXEL_UNITS):
+        return None, None
+    short = f"{layer.units[at[0]]:~}"
+    return (float(abs(layer.scale[at[0]])), float(abs(layer.scale[at[1]]))), short
+
+
+def _truth(told: dict[str, Any], data: Any, axes: str) -> Truth | None:
+    """Return the truth that a layer carries, if its data are still those it is the truth of."""
+    if "truth" not in told or "homographies" not in told:
+        return None
+    frames, height, width, channels = told["truth"].shape
+    order = "TYXC" if len(axes) == 4 else "TYX"
+    if (
+        axes != order
+        or data.shape != (frames, height, width, channels)[: len(order)]
+        or (data.ndim == 3) != (channels == 1)
+    ):
+        return None
+    return Truth(picture=told["truth"][0], homographies=told["homographies"])
+
+
+def _path(layer: Image, told: dict[str, Any]) -> str | None:
+    """Return the file that reads as this layer; not one that holds other frames or channels too, or did once."""
+    path, shape = layer.source.path, _data(layer).shape
+    if path is None:
+        return None
+    if "shape" in told:  # by the reader of this plugin
+        return str(path) if tuple(told["shape"]) == shape else None
+    if not str(path).lower().endswith(TIFF_ENDINGS):
+        return None
+    try:
+        with tifffile.TiffFile(path) as file:
+            return str(path) if file.series[0].shape == shape else None
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _words(layer: Image) -> str:
+    alpha = layer.rgb and (layer.data[0] if layer.multiscale else layer.data).shape[-1] == 4
+    return f"viewer.layers[{layer.name!r}].data{'[0]' if layer.multiscale else ''}{'[..., :3]' if alpha else ''}"

@@ -1,0 +1,221 @@
+"""What `napari.yaml` names: sample data, a reader, a writer, and commands of the Layers menu.
+
+Imported when napari starts to use one of them; loads neither torch nor, before it is needed, napari.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tifffile
+
+from napari_fiberburst.plugin import METADATA_KEY
+
+if TYPE_CHECKING:
+    from napari_fiberburst.burst import Burst
+
+LayerData = tuple[Any, dict[str, Any], str]
+_PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
+# As many frames and pixels as a sample can have that opens at once.
+_SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
+
+
+def make_sample(scene: str, physics: str) -> list[LayerData]:
+    """Return a simulated burst as an image layer, its truth in the layer's metadata.
+
+    Parameters
+    ----------
+    scene, physics : str
+        As in `napari_fiberburst.simulation.simulate`.
+    """
+    from napari_fiberburst.simulation import simulate
+
+    simulated = simulate(scene, shape=_SAMPLE_SHAPE, frames=_SAMPLE_FRAMES, physics=physics)
+    arrays = simulated.arrays()
+    frames, is_grey = arrays["frames"], simulated.scene.channels == 1
+    told = {
+        "recipe": {"scene": scene, "physics": physics},
+        "truth": arrays["truth"],
+        "homographies": arrays["homographies"],
+        "transmission": arrays["transmission"],
+    }
+    look = {
+        "name": f"{scene} ({physics})",
+        "rgb": not is_grey,
+        "axis_labels": ("t", "y", "x"),
+        "metadata": {METADATA_KEY: told},
+    }
+    return [(frames[..., 0] if is_grey else frames, look, "image")]
+
+
+def histology_mask() -> list[LayerData]:
+    """Sample: stained tissue, dimmed by the bundle."""
+    return make_sample("histology", "mask")
+
+
+def histology_core() -> list[LayerData]:
+    """Sample: stained tissue, one value a core."""
+    return make_sample("histology", "core")
+
+
+def retina_mask() -> list[LayerData]:
+    """Sample: the back of an eye, dimmed by the bundle."""
+    return make_sample("retina", "mask")
+
+
+def retina_core() -> list[LayerData]:
+    """Sample: the back of an eye, one value a core."""
+    return make_sample("retina", "core")
+
+
+def usaf_mask() -> list[LayerData]:
+    """Sample: a resolution chart, dimmed by the bundle."""
+    return make_sample("usaf", "mask")
+
+
+def usaf_core() -> list[LayerData]:
+    """Sample: a resolution chart, one value a core."""
+    return make_sample("usaf", "core")
+
+
+def tissue_mask() -> list[LayerData]:
+    """Sample: fibrous tissue, dimmed by the bundle."""
+    return make_sample("tissue", "mask")
+
+
+def tissue_core() -> list[LayerData]:
+    """Sample: fibrous tissue, one value a core."""
+    return make_sample("tissue", "core")
+
+
+def cat_mask() -> list[LayerData]:
+    """Sample: a cat, dimmed by the bundle."""
+    return make_sample("cat", "mask")
+
+
+def cat_core() -> list[LayerData]:
+    """Sample: a cat, one value a core."""
+    return make_sample("cat", "core")
+
+
+def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
+    """Return a reader for a folder of frames or an npz burst, None for anything else."""
+    if not isinstance(path, str):
+        return None
+    place = Path(path)
+    is_burst = place.suffix.lower() == ".npz" or (place.is_dir() and _holds_frames(place))
+    return read if is_burst else None
+
+
+def read(path: str | Sequence[str]) -> list[LayerData]:
+    """Open a burst as an image layer, with pixel size, unit and, where the file has it, the truth.
+
+    Raises
+    ------
+    BurstError
+        The file or folder is no usable burst.
+    """
+    from napari_fiberburst.io import read_burst
+
+    burst = read_burst(str(path))
+    frames = _as_recorded(burst)
+    look = _look(
+        burst, Path(str(path)), is_colour=frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8
+    )
+    if frames.ndim == 4 and not look["rgb"]:
+        frames = frames.transpose(0, 3, 1, 2)  # napari draws the last two axes
+    look["metadata"][METADATA_KEY]["shape"] = frames.shape
+    return [(frames, look, "image")]
+
+
+def write(path: str, data: Any, attributes: dict[str, Any]) -> list[str]:
+    """Write the picture of a run as OME-TIFF, with its settings and what it rests on as JSON beside it.
+
+    Other image layers become plain OME-TIFF: napari gives this writer every layer that is saved as ``.ome.tif``.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    told = attributes.get("metadata", {}).get(METADATA_KEY, {})
+    result = told.get("reconstruction")
+    if result is not None:
+        return [str(result.save(path))]
+    from napari_fiberburst.io.results import write_whole
+
+    with write_whole(Path(path)) as stream:
+        tifffile.imwrite(
+            stream, np.asarray(data), ome=True, photometric="rgb" if attributes.get("rgb") else "minisblack"
+        )
+    return [path]
+
+
+def reconstruct_layer() -> None:
+    """Open the dock and reconstruct the layer that is selected."""
+    _start("picture")
+
+
+def register_layer() -> None:
+    """Open the dock, register the frames of the layer that is selected, and show them moved into place."""
+    _start("stabilised burst")
+
+
+def _start(show: str) -> None:
+    import napari
+    from napari.utils.notifications import show_error
+
+    from napari_fiberburst.plugin.dock import FiberBurstWidget
+
+    viewer = napari.current_viewer()
+    if viewer is None:
+        return
+    layer = viewer.layers.selection.active
+    # From the menu, napari opens the dock under another name than from here.
+    open_already = [widget for widget in viewer.window.dock_widgets.values() if isinstance(widget, FiberBurstWidget)]
+    widget = open_already[0] if open_already else viewer.window.add_plugin_dock_widget(_PLUGIN, _WIDGET)[1]
+    if layer is None:
+        show_error("no layer is selected; select the burst's layer")
+    else:
+        widget.start_on(layer, show)
+
+
+def _holds_frames(folder: Path) -> bool:
+    from napari_fiberburst.io.folder import PICTURE_ENDINGS
+
+    return any(item.suffix.lower() in PICTURE_ENDINGS for item in folder.iterdir())
+
+
+def _as_recorded(burst: "Burst") -> np.ndarray:
+    """Return the frames in the type that they had in the file."""
+    values = burst.frames * (burst.white_level - burst.black_level) + burst.black_level
+    frames = np.rint(values).astype(burst.dtype) if burst.dtype.kind in "ui" else values.astype(burst.dtype)
+    return frames if "C" in burst.axes else frames[..., 0]
+
+
+def _look(burst: "Burst", path: Path, *, is_colour: bool) -> dict[str, Any]:
+    """Return how a burst is to be shown, with its pixel size and, in the metadata, its truth."""
+    axes = "tyx" if is_colour or "C" not in burst.axes else "tcyx"
+    look: dict[str, Any] = {
+        "name": path.stem,
+        "rgb": is_colour,
+        "axis_labels": tuple(axes),
+        "metadata": {METADATA_KEY: _truth(path)},
+    }
+    if burst.pixel_size is not None:
+        height, width = burst.pixel_size
+        sizes = {"y": height, "x": width}
+        look["scale"] = tuple(sizes.get(axis, 1.0) for axis in axes)
+        look["units"] = tuple(burst.unit or "µm" if axis in sizes else "pixel" for axis in axes)
+    return look
+
+
+def _truth(path: Path) -> dict[str, Any]:
+    """Return the truth that a simulated burst's file carries."""
+    if path.suffix.lower() != ".npz":
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        if not {"truth", "homographies"} <= set(arrays):
+            return {}
+        return {name: arrays[name] for name in ("truth", "homographies", "transmission") if name in arrays}

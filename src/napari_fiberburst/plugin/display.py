@@ -1,0 +1,198 @@
+"""What a run shows while it goes and when it is done: its state in words, its picture, its curves, its past."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import chain
+from typing import TYPE_CHECKING
+
+from napari.components import ViewerModel
+from qtpy.QtCore import QObject, Qt, QTimer, Signal
+from qtpy.QtGui import QMovie
+from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
+from superqt import QLabeledSlider
+
+from napari_fiberburst.plugin.curves import Curves
+from napari_fiberburst.plugin.history import Moment
+from napari_fiberburst.plugin.job import Job
+from napari_fiberburst.plugin.runs import KeptRun
+from napari_fiberburst.plugin.sections import section
+
+if TYPE_CHECKING:
+    from napari_fiberburst.solver import Progress
+
+# Per cent of an animation's own pace.
+_CALM, _USUAL = 4, 100
+_NOTHING_YET = "Choose a burst and press Start."
+
+
+class Display(QObject):
+    """Shows the run that is going, then its result; and the past of the run that is selected.
+
+    Its widgets stand in the dock where they belong: `status_box`, `curve_box` and `past_box`.
+
+    Parameters
+    ----------
+    viewer : ViewerModel
+        Whose theme to follow.
+    parent : QObject
+        Who owns it.
+    """
+
+    complete = Signal(object)  # the KeptRun whose last layer has been added
+
+    def __init__(self, viewer: ViewerModel, parent: QObject) -> None:
+        super().__init__(parent)
+        self.status = QLabel(_NOTHING_YET)
+        self.status.setWordWrap(True)
+        self.bar = QProgressBar()
+        self.slider = QLabeledSlider()
+        self._curves = Curves(viewer)
+        self.curve_box = section("Curves", self._curves)
+        self.status_box, self.past_box = self._lay_out()
+        self._selected: KeptRun | None = None
+        self._points: tuple[Job, float] | None = None
+        self._layers_to_come: Iterator[None] = iter(())
+        self._timer = QTimer(self)
+        self._timer.setInterval(0)
+        self._timer.timeout.connect(self._add_layer)
+        self.slider.valueChanged.connect(self._scrub)
+        self.curve_box.toggled.connect(lambda _: self._draw_curves())
+
+    def begin(self) -> None:
+        """Make way for a new run."""
+        self._curves.clear()
+        # No moving bar for "busy": where the canvas is drawn in software, every repaint takes time from the fit.
+        self.bar.setRange(0, 1)
+        self.bar.setValue(0)
+        self.status.setText("starting")
+
+    def preview(self, run: KeptRun, job: Job, report: "Progress") -> None:
+        """Show the picture that a running fit has come to, and keep it."""
+        if report.preview is not None and job.acquisition is not None:
+            run.history.add(Moment(report.seconds, report.preview, report.canvas))
+            run.layers.show_picture(report.preview, job.acquisition, report.canvas)
+            if run is self._selected:
+                self.select(run)
+
+    def report(self, run: KeptRun, job: Job, report: "Progress") -> None:
+        """Show where a running fit stands."""
+        if job.acquisition is None:
+            return
+        run.layers.show_frames(report.homographies, job.acquisition.shape[1:3])
+        self._points = job, job.acquisition.white_level - job.acquisition.black_level
+        self._draw_curves()
+        self.bar.setRange(0, report.iterations)
+        self.bar.setValue(report.step)
+        self.status.setText(_status(report))
+
+    def end(self, run: KeptRun, job: Job) -> None:
+        """Show the result of a run, layer by layer; then say so."""
+        result = job.result
+        if result is None:
+            return
+        run.result = result
+        run.scores = next((point.scores for point in reversed(job.curve) if point.scores is not None), None)
+        self._draw_curves()
+        self._points = None
+        notes = f"; {len(result.notes)} notes, see Runs" if result.notes else ""
+        self.status.setText(f"{run.name}: {result.ending} in {result.seconds:.1f} s{notes}")
+        self._layers_to_come = chain(
+            self._layers_to_come, run.layers.finish(result, run.source.frames), self._say_complete(run)
+        )
+        self._timer.start()
+
+    def fail(self) -> None:
+        """Say that a run came to nothing."""
+        self._points = None
+        self.status.setText("The run failed. Change the settings or the burst, and press Start.")
+
+    def select(self, run: KeptRun | None) -> None:
+        """Let the history be that of a run, at its newest picture; one that was gone back through shows it again."""
+        before = self._selected
+        if before is not None and before.result is not None and self.slider.value() < self.slider.maximum():
+            result = before.result
+            before.layers.show_picture(result.image, result.acquisition, result.canvas)
+        self._selected = run
+        self.slider.blockSignals(True)
+        self.slider.setMaximum(0 if run is None else max(0, len(run.history.moments) - 1))
+        self.slider.setValue(self.slider.maximum())
+        self.slider.blockSignals(False)
+
+    def shut_down(self) -> None:
+        """Show nothing more. May be called more than once."""
+        self._timer.stop()
+        self._curves.shut()
+
+    def open(self) -> None:
+        """Show again, where it was shut down."""
+        self._curves.open()
+
+    def _lay_out(self) -> tuple[QWidget, QWidget]:
+        self.bar.setTextVisible(False)
+        self.bar.setVisible(False)
+        self.slider.setOrientation(Qt.Orientation.Horizontal)
+        self.slider.setMaximum(0)
+        self.slider.setToolTip("Goes back through the pictures of the run that is selected.")
+        state, past = QWidget(), QWidget()
+        column, row = QVBoxLayout(state), QHBoxLayout(past)
+        for layout in (column, row):
+            layout.setContentsMargins(0, 0, 0, 0)
+        column.addWidget(self.bar)
+        column.addWidget(self.status)
+        row.addWidget(QLabel("history"))
+        row.addWidget(self.slider)
+        return state, past
+
+    def _add_layer(self) -> None:
+        """Add the next layer that waits; the window has a turn between two of them."""
+        if next(self._layers_to_come, self) is self:
+            self._timer.stop()
+
+    def _say_complete(self, run: KeptRun) -> Iterator[None]:
+        self.complete.emit(run)
+        yield
+
+    def _draw_curves(self) -> None:
+        if self._points is not None and self.curve_box.isExpanded():
+            job, span = self._points
+            self._curves.show_points(job.curve, span)
+
+    def _scrub(self, index: int) -> None:
+        """Show a picture of the past."""
+        run = self._selected
+        if run is not None and run.result is not None and index < len(run.history.moments):
+            moment = run.history.moments[index]
+            run.layers.show_picture(moment.picture, run.result.acquisition, moment.canvas)
+
+
+class Calm:
+    """Slows the little animations of a window down while a fit is going.
+
+    napari's sign of activity moves 30 times a second. Each time all of the window is drawn, which takes a graphics
+    card no time; but where the canvas is drawn in software, it takes more than half of the fit's speed.
+    """
+
+    def __init__(self) -> None:
+        self._slowed: list[QMovie] = []
+
+    def slow(self, window: QWidget) -> None:
+        """Slow down what moves in a window."""
+        self._slowed = [label.movie() for label in window.findChildren(QLabel) if label.movie() is not None]
+        for movie in self._slowed:
+            movie.setSpeed(_CALM)
+
+    def restore(self) -> None:
+        """Let it move as before. May be called more than once, and when the window is gone."""
+        for movie in self._slowed:
+            with suppress(RuntimeError):  # deleted with its window
+                movie.setSpeed(_USUAL)
+        self._slowed = []
+
+
+def _status(report: "Progress") -> str:
+    parts = [f"step {report.step} of {report.iterations}", f"{report.rate:.1f} it/s"]
+    if report.remaining is not None:
+        parts.append(f"{report.remaining:.0f} s left")
+    if report.loss == report.loss:  # not NaN, as before the frames are registered
+        parts.append(f"loss {report.loss:.3g}")
+    return " · ".join(parts)

@@ -1,0 +1,318 @@
+"""The dock widget "Fiber burst reconstruction"."""
+
+from contextlib import suppress
+from functools import partial
+from itertools import count
+from typing import TYPE_CHECKING, Any
+
+from napari.utils.notifications import show_error
+from qtpy.QtCore import QEvent, QSize, Qt
+from qtpy.QtWidgets import (
+    QLabel,
+    QPushButton,
+    QScrollArea,
+    QVBoxLayout,
+    QWidget,
+)
+from superqt.utils import create_worker
+
+from napari_fiberburst.errors import FiberBurstError, SettingsError
+from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.plugin.budget import in_words, refuse_what_cannot_fit
+from napari_fiberburst.plugin.bursts import BurstSource
+from napari_fiberburst.plugin.calls import as_python
+from napari_fiberburst.plugin.copying import CopyButtons
+from napari_fiberburst.plugin.display import Calm, Display
+from napari_fiberburst.plugin.form import SettingsForm
+from napari_fiberburst.plugin.input_box import InputBox
+from napari_fiberburst.plugin.job import Job, load_solver
+from napari_fiberburst.plugin.layer_combo import LayerWatch
+from napari_fiberburst.plugin.layers import RunLayers
+from napari_fiberburst.plugin.placement import Placement
+from napari_fiberburst.plugin.preferences import preferences, remember, remembered
+from napari_fiberburst.plugin.runner import Runner
+from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
+from napari_fiberburst.plugin.sections import row_of
+from napari_fiberburst.settings import Spline, choose
+
+if TYPE_CHECKING:
+    import napari
+    from napari.layers import Layer
+
+    from napari_fiberburst.solver import Progress
+
+_WIDTH = 350
+_FIRST_THING_TO_PRESS = "QPushButton:enabled { background-color: #2f6fd0; color: white; font-weight: bold; }"
+
+
+class FiberBurstWidget(QWidget):
+    """Load a burst, set it, watch it resolve.
+
+    Parameters
+    ----------
+    viewer : napari.viewer.Viewer
+        Whose layers are reconstructed, and where the results go.
+    """
+
+    def __init__(self, viewer: "napari.viewer.Viewer", parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._viewer = viewer
+        self._was_docked = False
+        self._shown_at_end = "picture"
+        self._run: KeptRun | None = None
+        self._missing: dict[str, str] | None = None
+        self._calm = Calm()
+        self._is_network = False
+        self.input = InputBox(viewer)
+        self.form = SettingsForm()
+        self.runner = Runner(self)
+        self.runs = RunsPanel()
+        self.display = Display(viewer, self)
+        self.start_button = QPushButton("Start")
+        self.pause_button = QPushButton("Pause")
+        self.stop_button = QPushButton("Stop")
+        self._memory = QLabel()
+        self.copying = CopyButtons(self.input, self.form)
+        self._preferences = preferences()
+        self.form.set_choices(remembered(self._preferences))
+        self._lay_out()
+        self._connect()
+        self._follow_state("ready")
+        self._estimate()
+        self._warm_up()
+
+    def start(self) -> None:
+        """Run what the form says. Does nothing while a run is going."""
+        if self.runner.state != "ready":
+            return
+        try:
+            source, choices = self.input.source(), self.form.choices()
+            refuse_what_cannot_fit(source, choices, self._missing)
+        except FiberBurstError as error:
+            show_error(str(error))
+            return
+        placement = self.input.placement(source)
+        self._begin(source, choices, placement, calibration=self.input.calibration.layer)
+
+    def continue_run(self, run: KeptRun, steps: int) -> None:
+        """Take a network's fit some steps further, as a run of its own."""
+        if self.runner.state == "ready" and run.result is not None:
+            choices = {"iterations": steps}
+            self._begin(run.source, choices, run.layers.placement, calibration=run.calibration, after=run)
+
+    def start_on(self, layer: "Layer", show: str = "picture") -> None:
+        """Reconstruct a layer with the form as it is, and show the picture or the stabilised burst in the end."""
+        if self.runner.state != "ready":
+            show_error("a run is going; stop it, or wait for its end, before the next one")
+        elif not self.input.burst.choose(layer):
+            show_error(f"layer {layer.name!r} is no image that could be a burst; select the layer with the frames")
+        else:
+            self.start()
+            self._shown_at_end = show
+
+    def shut_down(self) -> None:
+        """Stop what is running and let go of the viewer. May be called more than once."""
+        _let_go(self.runner, self.input.watch, self.display, self._calm)
+
+    def sizeHint(self) -> QSize:
+        """Ask for a narrow dock: the picture is what matters."""
+        return QSize(_WIDTH, super().sizeHint().height())
+
+    def event(self, event: QEvent) -> bool:
+        """Notice when the dock is closed for good: napari takes the widget out of it, and does not delete it."""
+        if event.type() == QEvent.Type.ParentChange:
+            if self.parent() is None and self._was_docked:
+                self.shut_down()
+                self._follow_state("ready")
+            elif self.parent() is not None:
+                self.input.watch.open()
+                self.display.open()
+            self._was_docked = self.parent() is not None
+        return super().event(event)
+
+    def _begin(
+        self,
+        source: BurstSource,
+        choices: dict[str, Any],
+        placement: Placement,
+        *,
+        calibration: "Layer | None" = None,
+        after: KeptRun | None = None,
+    ) -> None:
+        name = self._new_name()
+        from_layer = None if calibration is None else calibration.name
+        python = as_python(source, choices, from_layer, before="" if after is None else after.python)
+        told = {"run": name, "burst": source.name, "choices": choices, "python": python}
+        initial = None if after is None else after.result
+        settings = choose(**choices) if initial is None else initial.settings
+        self._is_network = not isinstance(settings.encoding, Spline)
+        self._preferences = preferences()
+        layers = RunLayers(self._viewer, name, placement, told)
+        job = Job(
+            source,
+            {**choices, "preview_every": 1 / self._preferences.previews_per_second},
+            calibration=None if calibration is None else calibration.data,
+            initial=initial,
+        )
+        self._run = KeptRun(
+            name=name, python=python, source=source, choices=choices, layers=layers, calibration=calibration
+        )
+        self._shown_at_end = "picture"
+        self.display.begin()
+        self.runs.add(self._run)
+        self.runner.start(job, f"{name} of {source.name}")
+
+    def _show(self, report: "Progress") -> None:
+        job, run = self.runner.job, self._run
+        if job is not None and run is not None:
+            self.form.show_chosen(report.settings)
+            self.display.report(run, job, report)
+
+    def _show_preview(self, report: "Progress") -> None:
+        if self.runner.job is not None and self._run is not None:
+            self.display.preview(self._run, self.runner.job, report)
+
+    def _keep(self, job: Job) -> None:
+        """Take over the result of a run."""
+        if self._run is not None and job.result is not None:
+            self.form.show_chosen(job.result.settings)
+            self.display.end(self._run, job)
+            self.runs.refresh()
+
+    def _show_what_was_asked(self, run: KeptRun) -> None:
+        """Hide the picture where something else of a result was asked for, now that all is there."""
+        if run is self._run and self._shown_at_end != "picture":
+            run.layers.set_visible(self._shown_at_end, True)
+            run.layers.set_visible("picture", False)
+
+    def _fail(self, problem: str) -> None:
+        """Say why a run came to nothing."""
+        if self._run is not None:
+            self.runs.remove(self._run)
+        self.display.fail()
+        show_error(problem)
+
+    def _forget(self, run: KeptRun) -> None:
+        if run is self._run:
+            self._run = None
+
+    def _follow_state(self, state: str) -> None:
+        """Offer what can be done now."""
+        is_ready = state == "ready"
+        if is_ready:
+            self._calm.restore()
+        else:
+            self._calm.slow(self.window())
+        self.start_button.setEnabled(is_ready)
+        self.pause_button.setEnabled(state in ("running", "paused"))
+        self.pause_button.setText("Continue" if state == "paused" else "Pause")
+        self.stop_button.setEnabled(state in ("running", "paused"))
+        self.input.set_enabled(is_ready)
+        self.form.set_running(not is_ready, is_network=self._is_network)
+        self.runs.set_running(not is_ready)
+        self.display.slider.setEnabled(is_ready)
+        self.display.bar.setVisible(not is_ready)
+        if state == "paused":
+            self.display.status.setText("paused")
+        elif state == "stopping":
+            self.display.status.setText("stopping; what there is will be kept")
+
+    def _toggle_pause(self) -> None:
+        if self.runner.state == "paused":
+            self.runner.resume()
+        else:
+            self.runner.pause()
+
+    def _turn_live(self, name: str, value: Any) -> None:
+        """Hand a changed sigma or learning rate to the running fit."""
+        job, run = self.runner.job, self._run
+        if job is None or run is None:
+            return
+        if value is None:
+            self.display.status.setText(f"{name.replace('_', ' ')} will be auto in the next run")
+            return
+        try:
+            setattr(job.control, name, value)
+        except SettingsError as error:
+            show_error(str(error))
+            return
+        seconds = job.curve[-1].seconds if job.curve else 0.0
+        run.turned_live.append((seconds, name, value))
+        run.layers.tell("turned_live", list(run.turned_live))
+
+    def _estimate(self) -> None:
+        """Say how much memory the run will take, and keep the choices."""
+        self._memory.setText("")
+        with suppress(FiberBurstError):
+            choices = self.form.choices()
+            remember(choices, self._preferences)
+            self._memory.setText(in_words(self.input.source(), choices, self._missing))
+
+    def _new_name(self) -> str:
+        """Return the first name that no run of this viewer has."""
+        taken = {layer.metadata.get(METADATA_KEY, {}).get("run") for layer in self._viewer.layers}
+        for dock in self.window().findChildren(FiberBurstWidget):  # a run may have no layer yet
+            taken |= {run.name for run in dock.runs.runs}
+        return next(name for number in count(1) if (name := f"run {number}") not in taken)
+
+    def _warm_up(self) -> None:
+        """Load torch in the background, which takes seconds, and learn which devices there are."""
+        create_worker(load_solver, _connect={"returned": self._take_missing}, _ignore_errors=True)
+
+    def _take_missing(self, missing: dict[str, str]) -> None:
+        self._missing = missing
+        self.form.show_devices(missing)
+
+    def _lay_out(self) -> None:
+        self.start_button.setStyleSheet(_FIRST_THING_TO_PRESS)
+        self.start_button.setToolTip("Reconstruct the burst; everything sets itself.")
+        self.stop_button.setToolTip("End the run; what it has come to is kept.")
+        self.pause_button.setToolTip("Hold the run where it is.")
+        content = QWidget()
+        column = QVBoxLayout(content)
+        column.addWidget(self.input)
+        column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
+        column.addWidget(self.display.status_box)
+        column.addWidget(self.form)
+        column.addWidget(self._memory)
+        column.addWidget(self.copying)
+        column.addWidget(self.display.curve_box)
+        column.addWidget(self.runs)
+        column.addWidget(self.display.past_box)
+        column.addStretch(1)
+        scroll = QScrollArea()
+        scroll.setWidgetResizable(True)
+        scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        scroll.setFrameShape(QScrollArea.Shape.NoFrame)
+        scroll.setWidget(content)
+        whole = QVBoxLayout(self)
+        whole.setContentsMargins(0, 0, 0, 0)
+        whole.addWidget(scroll)
+
+    def _connect(self) -> None:
+        self.start_button.clicked.connect(lambda: self.start())
+        self.pause_button.clicked.connect(self._toggle_pause)
+        self.stop_button.clicked.connect(self.runner.stop)
+        self.copying.copied.connect(self.display.status.setText)
+        self.input.changed.connect(self._estimate)
+        self.form.changed.connect(self._estimate)
+        self.form.turned_live.connect(self._turn_live)
+        self.runs.chosen.connect(self.display.select)
+        self.runs.removed.connect(self._forget)
+        self.runs.continue_asked.connect(self.continue_run)
+        self.runner.reported.connect(self._show)
+        self.runner.previewed.connect(self._show_preview)
+        self.runner.finished.connect(self._keep)
+        self.runner.stopped.connect(self._keep)
+        self.runner.failed.connect(self._fail)
+        self.runner.state_changed.connect(self._follow_state)
+        self.display.complete.connect(self._show_what_was_asked)
+        # The window can go without a word to this widget; what is called then must not need it.
+        self.destroyed.connect(partial(_let_go, self.runner, self.input.watch, self.display, self._calm))
+
+
+def _let_go(runner: Runner, watch: LayerWatch, display: Display, calm: Calm) -> None:
+    calm.restore()
+    runner.shut_down()
+    watch.close()
+    display.shut_down()

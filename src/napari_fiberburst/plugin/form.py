@@ -1,0 +1,251 @@
+"""The form of a run's settings: made from the settings themselves, showing only what applies."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from qtpy.QtCore import Qt, Signal
+from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
+
+from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.knobs import Knob, knobs_of
+from napari_fiberburst.plugin.knob_rows import KnobRow
+from napari_fiberburst.plugin.sections import form_layout, section
+from napari_fiberburst.settings import (
+    ENCODINGS,
+    MOTIONS,
+    PRESETS,
+    PUBLISHED_MOTIONS,
+    Settings,
+    choice_docs,
+    choose,
+)
+
+# Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides.
+_FIRST = ("sigma", "smoothness", "iterations", "time_budget", "device", "canvas", "upsample")
+_NOT_SHOWN = ("preview_every",)
+_LIVE = ("sigma", "learning_rate")
+_DEVICES = ("auto", "cpu", "cuda", "mps")
+_PRESET_TEXTS = {
+    "auto": "The burst calibrates its own bundle; seconds.",
+    "paper": "The published method, without a bundle model; minutes to hours.",
+}
+
+
+class SettingsForm(QWidget):
+    """Preset, motion, encoding and every knob that applies to them.
+
+    Attributes
+    ----------
+    problem : str
+        What is wrong with the choices; "" where nothing is.
+    """
+
+    changed = Signal()
+    turned_live = Signal(str, object)  # a knob that a running fit follows, and its value
+
+    def __init__(self, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.problem = ""
+        self._preset, self._motion, self._encoding = (QComboBox() for _ in range(3))
+        self._device = QComboBox()
+        self._device.addItems(_DEVICES)
+        knobs = _all_knobs()
+        self._device.setToolTip(knobs.pop("device").doc)
+        self._rows = {name: KnobRow(knob, self) for name, knob in knobs.items() if name not in _NOT_SHOWN}
+        self._first, self._rest = form_layout(), form_layout()
+        self._settings = PRESETS["auto"]
+        self._is_running = False
+        self._lay_out()
+        self._fill("auto", {})
+        self._connect()
+
+    @property
+    def preset(self) -> str:
+        """The preset's name."""
+        return self._preset.currentText()
+
+    def choices(self) -> dict[str, Any]:
+        """Return what `napari_fiberburst.reconstruct` takes by name to do as the form says, and no more than needed.
+
+        Raises
+        ------
+        SettingsError
+            The choices do not go together.
+        """
+        preset = PRESETS[self.preset]
+        named: dict[str, Any] = {} if self.preset == next(iter(PRESETS)) else {"preset": self.preset}
+        observation = self._rows["observation"].value
+        if observation != preset.observation:
+            named["observation"] = observation
+        start = choose(**{"preset": self.preset, **named})
+        for part, box in (("motion", self._motion), ("encoding", self._encoding)):
+            if box.currentText() != getattr(start, part).name:
+                named[part] = box.currentText()
+        base = choose(**named)
+        values = {name: self._value(name) for name in base.knobs if name not in (*_NOT_SHOWN, "observation")}
+        turned = {name: value for name, value in values.items() if value is not None and value != _own(base, name)}
+        choose(**named, **turned)
+        return {**named, **turned}
+
+    def set_choices(self, choices: Mapping[str, Any]) -> None:
+        """Show choices as `choices` returned them; those this version does not know are left out."""
+        preset = choices.get("preset", next(iter(PRESETS)))
+        known = {name: value for name, value in choices.items() if name != "preset"}
+        try:
+            choose(preset, **known)
+        except SettingsError:
+            preset, known = next(iter(PRESETS)), {}
+        self._fill(preset, known)
+        self.changed.emit()
+
+    def show_chosen(self, settings: Settings) -> None:
+        """Say what a run has chosen for knobs that were left open."""
+        for name, row in self._rows.items():
+            if row.knob.optional and name in settings.knobs:
+                row.show_chosen(_own(settings, name))
+
+    def set_running(self, is_running: bool, *, is_network: bool = False) -> None:
+        """Lock all but what a running fit follows; sigma and the learning rate are a network's."""
+        self._is_running = is_running
+        for widget in (self._preset, self._motion, self._encoding, self._device):
+            widget.setEnabled(not is_running)
+        for name, row in self._rows.items():
+            row.setEnabled(not is_running or (name in _LIVE and is_network))
+
+    def show_devices(self, missing: Mapping[str, str]) -> None:
+        """Lock the devices that are not on this machine, and say why: {name: reason}."""
+        for number, name in enumerate(_DEVICES):
+            item = self._device.model().item(number)
+            item.setEnabled(name not in missing)
+            item.setToolTip(missing.get(name, ""))
+
+    def _lay_out(self) -> None:
+        texts = {(part, name): text for part, name, text in choice_docs()}
+        for box, part, names in (
+            (self._preset, "preset", PRESETS),
+            (self._motion, "motion", ()),
+            (self._encoding, "encoding", ENCODINGS),
+        ):
+            for name in names:
+                box.addItem(name)
+                tip = _PRESET_TEXTS[name] if part == "preset" else texts[part, name]
+                box.setItemData(box.count() - 1, tip, Qt.ItemDataRole.ToolTipRole)
+        self._preset.setToolTip("Where settings start from; choosing one sets everything back to it.")
+        self._motion.setToolTip("How the object moves between frames.")
+        self._encoding.setToolTip("How the scene is held while it is fitted.")
+        for label, box in (("preset", self._preset), ("motion", self._motion), ("encoding", self._encoding)):
+            self._first.addRow(label, box)
+        for name in _FIRST:
+            row = self._device if name == "device" else self._rows[name]
+            self._first.addRow(name.replace("_", " "), row)
+        for name, row in self._rows.items():
+            if name not in _FIRST:
+                self._rest.addRow(row.label, row)
+        hidden = QWidget()
+        hidden.setLayout(self._rest)
+        self._hint = QLabel()
+        self._hint.setWordWrap(True)
+        self._hint.setVisible(False)
+        whole = QVBoxLayout(self)
+        whole.setContentsMargins(0, 0, 0, 0)
+        whole.addLayout(self._first)
+        whole.addWidget(self._hint)
+        whole.addWidget(section("More settings", hidden))
+
+    def _connect(self) -> None:
+        self._preset.currentTextChanged.connect(self._take_preset)
+        for box in (self._motion, self._encoding):
+            box.currentTextChanged.connect(self._follow)
+        self._device.currentTextChanged.connect(self._follow)
+        for name, row in self._rows.items():
+            row.changed.connect(lambda name=name: self._turn(name))
+
+    def _take_preset(self, name: str) -> None:
+        self._fill(name, {})
+        self.changed.emit()
+
+    def _turn(self, name: str) -> None:
+        if self._is_running:
+            self.turned_live.emit(name, self._rows[name].value)
+        else:
+            self._follow()
+
+    def _follow(self, *_: Any) -> None:
+        """Show what applies now, and whether it goes together."""
+        named = {"motion": self._motion.currentText(), "encoding": self._encoding.currentText()}
+        observation = self._rows["observation"].value
+        try:
+            if (observation == "frames") != self._settings.is_published:
+                # The other family of motions comes with its own values.
+                self._show(choose(self.preset, observation=observation))
+            else:
+                base = choose(self._settings, **named)
+                changed = base.encoding.name != self._settings.encoding.name
+                changed |= base.motion.name != self._settings.motion.name
+                if changed:
+                    self._show(choose(base, **self._shared(base)))
+            self.choices()
+            self.problem = ""
+        except SettingsError as error:
+            self.problem = str(error)
+        self._hint.setText(self.problem)
+        self._hint.setVisible(bool(self.problem))
+        self.changed.emit()
+
+    def _shared(self, base: Settings) -> dict[str, Any]:
+        """Return what the form says of the knobs that both the old and the new choice have."""
+        known = [name for name in base.knobs if name in self._settings.knobs and name not in _NOT_SHOWN]
+        return {name: self._value(name) for name in known if name != "observation"}
+
+    def _fill(self, preset: str, choices: Mapping[str, Any]) -> None:
+        self._preset.blockSignals(True)
+        self._preset.setCurrentText(preset)
+        self._preset.blockSignals(False)
+        self._show(choose(preset, **choices))
+        self.problem = ""
+        self._hint.setVisible(False)
+
+    def _show(self, settings: Settings) -> None:
+        """Take the form to settings, and show only their knobs."""
+        self._settings = settings
+        for box in (self._motion, self._encoding, self._device):
+            box.blockSignals(True)
+        self._motion.clear()
+        texts = {name: text for part, name, text in choice_docs() if part == "motion"}
+        for name in settings.motions:
+            self._motion.addItem(name)
+            self._motion.setItemData(self._motion.count() - 1, texts.get(name, ""), Qt.ItemDataRole.ToolTipRole)
+        self._motion.setCurrentText(settings.motion.name)
+        self._encoding.setCurrentText(settings.encoding.name)
+        if self._device.findText(settings.device) < 0:
+            self._device.addItem(settings.device)
+        self._device.setCurrentText(settings.device)
+        for box in (self._motion, self._encoding, self._device):
+            box.blockSignals(False)
+        for layout in (self._first, self._rest):
+            for number in range(layout.rowCount()):
+                row = layout.itemAt(number, QFormLayout.ItemRole.FieldRole).widget()
+                if isinstance(row, KnobRow):
+                    layout.setRowVisible(number, row.knob.name in settings.knobs)
+        named = {"motion": settings.motion.name, "encoding": settings.encoding.name}
+        base = choose(self.preset, observation=settings.observation, **named)
+        for name in settings.knobs:
+            if name in self._rows:
+                self._rows[name].set_value(_own(settings, name))
+                self._rows[name].allow_open(_own(base, name) is None)
+
+    def _value(self, name: str) -> Any:
+        return self._device.currentText() if name == "device" else self._rows[name].value
+
+
+def _all_knobs() -> dict[str, Knob]:
+    owners = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
+    return {name: knob for owner in owners for name, knob in knobs_of(owner).items()}
+
+
+def _own(settings: Settings, name: str) -> Any:
+    """Return a knob's value, wherever in the settings it is."""
+    for part in (settings.encoding, settings.motion, settings):
+        if name in knobs_of(type(part)):
+            return getattr(part, name)
+    raise SettingsError(f"{name} is no setting")

@@ -1,0 +1,60 @@
+"""The pictures that a run has shown, to go back through."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_fiberburst.reconstruction import Canvas
+
+_MOST_BYTES = 128 * 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A picture as it was.
+
+    Attributes
+    ----------
+    seconds : float
+        Since the run's first step.
+    picture : numpy.ndarray
+        (H, W) or (H, W, C) float32 in intensity units.
+    canvas : Canvas
+        Where it lies.
+    """
+
+    seconds: float
+    picture: NDArray[np.float32]
+    canvas: Canvas
+
+
+class History:
+    """Keeps the first picture, the newest, and as many between as memory allows, evenly.
+
+    Parameters
+    ----------
+    most_bytes : int
+        Of all pictures together.
+    """
+
+    def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
+        self._most = most_bytes
+        self._every, self._offered = 1, 0
+        self._kept: list[tuple[int, Moment]] = []
+
+    @property
+    def moments(self) -> list[Moment]:
+        """The pictures kept, oldest first."""
+        return [moment for _, moment in self._kept]
+
+    def add(self, moment: Moment) -> None:
+        """Keep a picture; where memory is full, every second one is let go, now and from now on."""
+        if self._kept and self._kept[-1][0] % self._every:
+            self._kept.pop()  # it was there as the newest alone
+        self._kept.append((self._offered, moment))
+        self._offered += 1
+        while len(self._kept) > 2 and sum(kept.picture.nbytes for _, kept in self._kept) > self._most:
+            self._every *= 2
+            *older, newest = self._kept
+            self._kept = [*(item for item in older if item[0] % self._every == 0), newest]

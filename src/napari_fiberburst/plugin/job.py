@@ -1,0 +1,229 @@
+"""One call of `reconstruct`, to be made in another thread. Knows nothing of Qt."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_fiberburst.control import Control
+from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.plugin.bursts import BurstSource, Truth
+from napari_fiberburst.streaming import Latest
+
+if TYPE_CHECKING:
+    from napari_fiberburst.burst import Acquisition
+    from napari_fiberburst.reconstruction import Reconstruction
+    from napari_fiberburst.solver import Progress
+
+logger = logging.getLogger(__name__)
+
+# Comparing a picture with the truth takes as long as some steps do; a run that is watched must not be slowed.
+_SCORING_SHARE = 0.05
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scores:
+    """How close a picture and a motion are to a simulated burst's truth.
+
+    Attributes
+    ----------
+    psnr : float
+        dB, frame 0, after one gain and offset per channel.
+    ssim : float
+        Of the same.
+    motion_error : float
+        Mean distance in pixels, gauge removed.
+    """
+
+    psnr: float
+    ssim: float
+    motion_error: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurvePoint:
+    """One point of the curves a run draws.
+
+    Attributes
+    ----------
+    seconds : float
+        Since the run's first step.
+    loss : float
+        As in `Progress`.
+    sample_error : float or None
+        As in `Progress`.
+    scores : Scores or None
+        Where they were taken at this point.
+    """
+
+    seconds: float
+    loss: float
+    sample_error: float | None
+    scores: Scores | None
+
+
+class Job:
+    """A run in the making: what it works on, how it is steered, and what it has said so far.
+
+    Parameters
+    ----------
+    source : BurstSource
+        The burst, still in its layers.
+    choices : mapping
+        What `napari_fiberburst.reconstruct` takes by name.
+    calibration : array, optional
+        Picture of the bundle in even light.
+    initial : Reconstruction, optional
+        To continue from.
+
+    Attributes
+    ----------
+    control : Control
+        To stop, pause and steer it.
+    acquisition : Acquisition or None
+        What is known of the burst, once it is read.
+    reports, previews : Latest
+        The newest `Progress`, and the newest one with a preview, for whoever looks.
+    curve : list of CurvePoint
+        All points so far; grows at its end alone.
+    result : Reconstruction or None
+        Once there is one.
+    problem : str
+        Why there is none, in words for the user.
+    """
+
+    def __init__(
+        self,
+        source: BurstSource,
+        choices: Mapping[str, Any],
+        *,
+        calibration: Any = None,
+        initial: "Reconstruction | None" = None,
+    ) -> None:
+        self._source: BurstSource | None = source
+        self._choices = dict(choices)
+        self._calibration, self._initial = calibration, initial
+        self._truth = _cropped(source)
+        self._scored = self._scoring = 0.0
+        self.control = Control()
+        self.acquisition: Acquisition | None = None
+        self.reports: Latest[Progress] = Latest()
+        self.previews: Latest[Progress] = Latest()
+        self.curve: list[CurvePoint] = []
+        self.result: Reconstruction | None = None
+        self.problem = ""
+
+    def run(self, should_stop: Callable[[], bool]) -> None:
+        """Make the call; raises nothing, for a worker's errors reach the window by more than one way."""
+        # torch takes seconds to load, which the window must not wait for.
+        from napari_fiberburst.solver import reconstruct
+
+        assert self._source is not None
+        try:
+            burst = self._source.read()
+            self.acquisition = burst.acquisition
+            result = reconstruct(
+                burst,
+                **self._choices,
+                calibration=self._calibration,
+                initial=self._initial,
+                control=self.control,
+                should_stop=should_stop,
+                on_progress=self._take,
+            )
+            if not np.isfinite(result.image).any():
+                raise FiberBurstError(
+                    f"the fit came to no numbers ({result.ending}); try the preset auto, or a lower learning rate"
+                )
+            self.result = result
+        except FiberBurstError as error:
+            self.problem = str(error)
+        except Exception as error:  # whatever it is, the window must hear of it and be ready again
+            logger.exception("the reconstruction failed")
+            self.problem = _explain(error)
+
+    def release(self) -> None:
+        """Let go of all that is large. napari keeps every worker, and a worker its job, as long as the viewer."""
+        self._source = self._initial = self._calibration = self._truth = self.result = None
+        self.reports, self.previews = Latest(), Latest()
+        self.curve = []
+
+    def _take(self, report: "Progress") -> None:
+        scores = self._score(report)
+        self.curve.append(
+            CurvePoint(seconds=report.seconds, loss=report.loss, sample_error=report.sample_error, scores=scores)
+        )
+        self.reports.put(report)
+        if report.preview is not None:
+            self.previews.put(report)
+
+    def _score(self, report: "Progress") -> Scores | None:
+        """Compare with the truth where there is one and a picture, now and then."""
+        began = time.perf_counter()
+        is_soon = began - self._scored < self._scoring / _SCORING_SHARE and report.remaining != 0
+        if self._truth is None or report.preview is None or report.settings.canvas != "frame" or is_soon:
+            return None
+        if not np.allclose(report.homographies[0], np.eye(3), atol=1e-6):
+            return None  # the picture is over another frame, for frame 0 is of no use
+        scores = score(report.preview, report.homographies, self._truth)
+        self._scored = time.perf_counter()
+        self._scoring = self._scored - began
+        return scores
+
+
+def score(picture: NDArray[np.float32], homographies: NDArray[np.float64], truth: Truth) -> Scores:
+    """Compare a picture of frame 0's field, at any scale, and a motion with the truth."""
+    from skimage.transform import resize
+
+    from napari_fiberburst.quality import motion_error, psnr, ssim
+
+    shown = picture if picture.ndim == 3 else picture[..., None]
+    known = np.isfinite(shown)
+    # Where no core has looked there is nothing to compare: the mean stands for it, as a viewer's eye would have it.
+    shown = np.where(known, shown, shown.mean(axis=(0, 1), where=known))
+    wanted = truth.picture
+    if shown.shape != wanted.shape:
+        shown = resize(shown, wanted.shape, anti_aliasing=True, preserve_range=True)
+    return Scores(
+        psnr=psnr(shown, wanted),
+        ssim=ssim(shown, wanted),
+        motion_error=motion_error(homographies, truth.homographies, wanted.shape[:2]),
+    )
+
+
+def _cropped(source: BurstSource) -> Truth | None:
+    """Return the truth of the region that is used."""
+    truth = source.truth
+    if truth is None or source.region is None:
+        return truth
+    (y0, y1), (x0, x1) = source.region
+    inside = np.array([[1, 0, x0], [0, 1, y0], [0, 0, 1]], dtype=np.float64)
+    return Truth(
+        picture=truth.picture[y0:y1, x0:x1],
+        homographies=np.linalg.inv(inside) @ truth.homographies @ inside,
+    )
+
+
+def _explain(error: Exception) -> str:
+    """Say what an unforeseen error means for the user; torch tells of too little memory in a RuntimeError."""
+    words = str(error).lower()
+    if isinstance(error, MemoryError) or "out of memory" in words or "allocate memory" in words:
+        return (
+            "there was not enough memory for this run; draw a region, use fewer frames, lower the upsampling, or "
+            f"choose another device ({type(error).__name__}: {error})"
+        )
+    return (
+        f"the run failed for a reason that was not foreseen ({type(error).__name__}: {error}); if it happens again, "
+        "please report it with what the terminal says"
+    )
+
+
+def load_solver() -> dict[str, str]:
+    """Load PyTorch, which takes seconds, ahead of the first run; return the devices that are not here, and why."""
+    from napari_fiberburst.solver.device import missing_devices
+
+    return missing_devices()

@@ -1,0 +1,178 @@
+"""Runs a job beside the window: one at a time, steered by events, ended in one of three ways."""
+
+import io
+import time
+from typing import TYPE_CHECKING, Literal
+
+from napari.qt.threading import FunctionWorker, create_worker
+from napari.utils import progress
+from qtpy.QtCore import QObject, QTimer, Signal
+
+from napari_fiberburst.plugin.job import Job
+
+if TYPE_CHECKING:
+    from napari_fiberburst.solver import Progress
+
+# The window is brought up to date ten times a second, or less often where that would take more than this part of the
+# time: where the canvas is drawn in software, as on remote desktops, the fit needs those processors.
+_MILLISECONDS = 100
+_PICTURES_SHARE, _WORDS_SHARE = 0.25, 0.08
+
+State = Literal["ready", "running", "paused", "stopping"]
+
+
+class Runner(QObject):
+    """Starts, pauses and stops jobs, and says what becomes of them.
+
+    Signals come in this order: `started`, any number of `previewed` and `reported`, one of `finished`, `stopped` and
+    `failed`, then `ready`. After `shut_down` none comes; where napari ends its workers, because it closes, `ready`
+    alone.
+
+    Attributes
+    ----------
+    state : str
+        "ready", "running", "paused" or "stopping".
+    """
+
+    started = Signal(object)  # the Job
+    reported = Signal(object)  # its newest Progress
+    previewed = Signal(object)  # its newest Progress with a preview
+    finished = Signal(object)  # the Job, with its result
+    stopped = Signal(object)  # the Job, with its result so far
+    failed = Signal(str)  # why, for the user
+    ready = Signal()
+    state_changed = Signal(str)
+
+    def __init__(self, parent: QObject | None = None) -> None:
+        super().__init__(parent)
+        self.state: State = "ready"
+        self._job: Job | None = None
+        self._worker: FunctionWorker[None] | None = None
+        self._progress: progress | None = None
+        self._timer = QTimer(self)
+        self._timer.setInterval(_MILLISECONDS)
+        self._timer.timeout.connect(self._look)
+        self._looked = self._drawn = self._drawing = 0.0
+        self._has_picture = False
+
+    @property
+    def job(self) -> Job | None:
+        """The job that is running."""
+        return self._job
+
+    def start(self, job: Job, name: str) -> None:
+        """Run a job.
+
+        Raises
+        ------
+        RuntimeError
+            Another one is running.
+        """
+        if self._job is not None:
+            raise RuntimeError("one run at a time: stop the one that is running first")
+        self._job = job
+        # A plain function, for a generator's worker swallows RuntimeError, which is what torch raises.
+        self._worker = worker = create_worker(job.run, lambda: worker.abort_requested, _ignore_errors=True)
+        worker.finished.connect(self._end)
+        # Where there is no window for it, napari's bar would go to the terminal.
+        self._progress = progress(total=1, desc=name, file=io.StringIO())
+        self._set(state="running")
+        self.started.emit(job)
+        self._drawn = self._drawing = 0.0
+        self._has_picture = False
+        self._timer.start()
+        worker.start()
+
+    def pause(self) -> None:
+        """Hold the run before its next step."""
+        if self._job is not None and self.state == "running":
+            self._job.control.pause()
+            self._set(state="paused")
+
+    def resume(self) -> None:
+        """Let a paused run go on."""
+        if self._job is not None and self.state == "paused":
+            self._job.control.resume()
+            self._set(state="running")
+
+    def stop(self) -> None:
+        """End the run after the step it is in; it keeps what it has."""
+        if self._job is not None and self.state != "stopping":
+            self._job.control.stop()
+            self._set(state="stopping")
+
+    def shut_down(self) -> None:
+        """Stop for good, without a word: the window is going. May be called more than once."""
+        if self._job is not None and self._worker is not None:
+            self._worker.finished.disconnect(self._end)
+            self._worker.finished.connect(self._job.release)
+            self._job.control.stop()
+            self._timer.stop()
+            self._close_progress()
+        self._job = self._worker = None
+        self.state = "ready"
+
+    def _look(self, *, last: bool = False) -> None:
+        """Hand on what is new, as often as the window can bear."""
+        job, worker = self._job, self._worker
+        if job is None or worker is None or worker.abort_requested:
+            return
+        now = time.perf_counter()
+        for box, signal, share in (
+            (job.previews, self.previewed, _PICTURES_SHARE),
+            (job.reports, self.reported, _WORDS_SHARE),
+        ):
+            if self._job is not job:
+                return  # napari's progress bar lets events through, the end of the run among them
+            # The first picture is what a user waits for.
+            is_first = box is job.previews and not self._has_picture
+            is_due = last or is_first or now - self._drawn >= self._drawing / share
+            report = box.take() if is_due else None
+            if report is not None:
+                self._has_picture = self._has_picture or report.preview is not None
+                signal.emit(report)
+                self._show_progress(report)
+                self._looked = now
+                # Comes back once the window has been drawn.
+                QTimer.singleShot(0, self._note_drawing)
+
+    def _note_drawing(self) -> None:
+        self._drawn = time.perf_counter()
+        self._drawing = self._drawn - self._looked
+
+    def _show_progress(self, report: "Progress") -> None:
+        bar = self._progress
+        if bar is not None and bar.total != report.iterations:
+            bar.total = report.iterations
+        if bar is not None and bar is self._progress:
+            bar.update(report.step - bar.n)
+
+    def _end(self) -> None:
+        job, worker = self._job, self._worker
+        if job is None or worker is None:
+            return
+        self._timer.stop()
+        self._look(last=True)
+        self._close_progress()
+        self._job = self._worker = None
+        self.state = "ready"
+        if worker.abort_requested:
+            pass  # napari is closing: there may be no window to show anything in
+        elif job.result is None:
+            self.failed.emit(job.problem)
+        elif job.result.ending == "stopped":
+            self.stopped.emit(job)
+        else:
+            self.finished.emit(job)
+        job.release()
+        self.state_changed.emit(self.state)
+        self.ready.emit()
+
+    def _close_progress(self) -> None:
+        if self._progress is not None:
+            self._progress.close()
+            self._progress = None
+
+    def _set(self, state: State) -> None:
+        self.state = state
+        self.state_changed.emit(state)

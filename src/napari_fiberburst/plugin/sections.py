@@ -1,0 +1,40 @@
+"""How the dock is laid out: sections that fold away, rows."""
+
+from qtpy.QtGui import QIcon
+from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QVBoxLayout, QWidget
+from superqt import QCollapsible
+
+_ABOVE_CONTENT = 4
+
+
+def section(title: str, content: QWidget) -> QCollapsible:
+    """Return a section around a widget, folded: it takes one line."""
+    # superqt draws its own arrows once, in the colours that were there before the viewer's theme.
+    folded, unfolded = f"▸  {title}", f"▾  {title}"
+    made = QCollapsible(folded, expandedIcon=QIcon(), collapsedIcon=QIcon())
+    made.layout().setContentsMargins(0, 0, 0, 0)
+    made.layout().setSpacing(0)
+    holder = QWidget()
+    inside = QVBoxLayout(holder)
+    inside.setContentsMargins(0, _ABOVE_CONTENT, 0, 0)
+    inside.addWidget(content)
+    made.setContent(holder)
+    made.collapse(animate=False)
+    made.toggled.connect(lambda is_open: made.setText(unfolded if is_open else folded))
+    return made
+
+
+def form_layout() -> QFormLayout:
+    """Return a layout of labelled rows that fill the dock's width."""
+    layout = QFormLayout()
+    layout.setFieldGrowthPolicy(QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
+    layout.setContentsMargins(0, 0, 0, 0)
+    return layout
+
+
+def row_of(*widgets: QWidget) -> QHBoxLayout:
+    """Return widgets side by side."""
+    row = QHBoxLayout()
+    for widget in widgets:
+        row.addWidget(widget)
+    return row

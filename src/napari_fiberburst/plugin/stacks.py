@@ -1,0 +1,67 @@
+"""Stacks of one picture a frame that are only made for the frame that is shown."""
+
+from typing import TYPE_CHECKING, Any
+
+import dask.array as da
+import numpy as np
+from dask.delayed import delayed
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from napari_fiberburst.evidence import Cores
+    from napari_fiberburst.reconstruction import Canvas
+
+
+def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas") -> da.Array:
+    """Return the frames as they came, moved onto the canvas: the object stands still, the honeycomb moves.
+
+    Parameters
+    ----------
+    frames : array
+        (T, H, W) or (T, H, W, C), numpy or dask.
+    homographies : numpy.ndarray
+        (T, 3, 3), frame-t pixel to frame-0 pixel; a frame with NaN becomes 0.
+    canvas : Canvas
+        Where to.
+
+    Returns
+    -------
+    dask.array.Array
+        (T, H', W') or (T, H', W', C) in the frames' type; 0 where a frame did not look.
+    """
+    shape = (*canvas.shape, *frames.shape[3:])
+    moved = [
+        da.from_delayed(delayed(_move)(frames[index], homography, canvas), shape, frames.dtype)
+        for index, homography in enumerate(homographies)
+    ]
+    return da.stack(moved)
+
+
+def residual_maps(residuals: NDArray[np.float32], cores: "Cores", shape: tuple[int, int]) -> da.Array:
+    """Return by how much the model misses each core in each frame, as pictures (T, H, W); NaN between cores."""
+    rows, columns = np.indices(shape)
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    distance, nearest = cKDTree(cores.centres).query(pixels, distance_upper_bound=cores.pitch)
+    inside = np.isfinite(distance).reshape(shape)
+    nearest = np.where(inside, nearest.reshape(shape), 0)
+    maps = [da.from_delayed(delayed(_paint)(frame, nearest, inside), shape, np.float32) for frame in residuals]
+    return da.stack(maps)
+
+
+def _move(frame: Any, homography: NDArray[np.float64], canvas: "Canvas") -> NDArray[Any]:
+    frame = np.asarray(frame)
+    shape = (*canvas.shape, *frame.shape[2:])
+    if not np.isfinite(homography).all():
+        return np.zeros(shape, frame.dtype)
+    points = canvas.points()
+    mapped = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ np.linalg.inv(homography).T
+    at = (mapped[..., :2] / mapped[..., 2:])[..., ::-1].transpose(2, 0, 1)
+    channels = frame.reshape(*frame.shape[:2], -1)
+    moved = [map_coordinates(channel, at, order=1, output=frame.dtype) for channel in channels.transpose(2, 0, 1)]
+    return np.stack(moved, axis=-1).reshape(shape)
+
+
+def _paint(values: NDArray[np.float32], nearest: NDArray[np.intp], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return np.where(inside, values[nearest], np.nan).astype(np.float32)

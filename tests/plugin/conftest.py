@@ -1,0 +1,69 @@
+"""A viewer with the dock in it, and a burst to run; nothing is written to the user's own settings."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from napari.layers import Image
+from napari.utils import progress
+from qtpy.QtCore import QSettings
+
+from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.simulation import SimulatedBurst, simulate
+
+MILLISECONDS = 60_000
+
+
+@pytest.fixture(autouse=True)
+def _own_store(tmp_path, monkeypatch):
+    """Keep the form's memory in this test's folder."""
+    QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
+
+
+@pytest.fixture(scope="session")
+def simulated() -> SimulatedBurst:
+    """Return 8 RGB frames of 63 x 75 pixels, cores 4 pixels apart."""
+    return simulate("histology", shape=(63, 75), frames=8, pitch=4.0, seed=3)
+
+
+@pytest.fixture
+def burst_layer(simulated) -> Image:
+    """Return the burst as a sample layer has it, its truth in the metadata."""
+    arrays = simulated.arrays()
+    told = {"truth": arrays["truth"], "homographies": arrays["homographies"], "recipe": {"scene": "histology"}}
+    return Image(arrays["frames"], rgb=True, name="burst", metadata={"fiberburst": told})
+
+
+@pytest.fixture
+def open_dock(make_napari_viewer, qtbot) -> Callable[..., Any]:
+    """Return a function that opens a viewer with the dock and these layers; returns both."""
+
+    def opened(*layers: Image) -> tuple[Any, FiberBurstWidget]:
+        viewer = make_napari_viewer()
+        for layer in layers:
+            viewer.add_layer(layer)
+        dock = FiberBurstWidget(viewer)
+        viewer.window.add_dock_widget(dock, name="fiber burst")
+        return viewer, dock
+
+    yield opened
+    assert not progress._all_instances
+
+
+@pytest.fixture
+def run_through(qtbot) -> Callable[[FiberBurstWidget], Any]:
+    """Return a function that starts the dock, waits for the last layer, and returns the run."""
+
+    def ran(dock: FiberBurstWidget) -> Any:
+        with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
+            dock.start()
+        return dock.runs.run
+
+    return ran
+
+
+@pytest.fixture
+def grey_frames(simulated) -> np.ndarray:
+    """Return the burst's green channel as it was recorded, (8, 63, 75) uint8."""
+    return simulated.arrays()["frames"][..., 1]

@@ -1,0 +1,126 @@
+"""The form says what `reconstruct` is to do, no more, and shows only what applies."""
+
+import pytest
+from qtpy.QtCore import Qt
+
+from napari_fiberburst.plugin.form import SettingsForm
+from napari_fiberburst.plugin.preferences import Preferences, remember, remembered
+from napari_fiberburst.settings import ENCODINGS, MOTIONS, choose
+
+
+@pytest.fixture
+def form(qtbot):
+    made = SettingsForm()
+    qtbot.addWidget(made)
+    made.show()
+    return made
+
+
+def shown(form):
+    """Return the names of the knobs that can be seen."""
+    for layout in (form._first, form._rest):
+        yield from (name for name, row in form._rows.items() if layout.indexOf(row) >= 0 and layout.isRowVisible(row))
+
+
+def test_a_fresh_form_asks_for_nothing(form):
+    assert form.choices() == {}
+    assert form.preset == "auto"
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"motion": "affine"},
+        {"upsample": 2.0, "canvas": "union"},
+        {"smoothness": 0.125},
+        {"encoding": "fourier", "sigma": 3.0, "learning_rate": 0.001},
+        {"encoding": "hash", "levels": 5, "iterations": 77},
+        {"preset": "paper"},
+        {"preset": "paper", "sigma": 2.0, "motion": "flow_tv", "tv_weight": 0.5},
+        {"observation": "frames", "encoding": "siren"},
+        {"motion": "flow", "encoding": "nerf"},
+        {"device": "cpu", "fill": True, "seed": 7, "time_budget": 12.5},
+    ],
+)
+def test_the_form_gives_back_what_it_was_set_to(form, choices):
+    form.set_choices(choices)
+    assert choose(**form.choices()) == choose(**choices)
+    assert form.problem == ""
+
+
+def test_only_what_applies_is_shown(form):
+    assert {"smoothness", "upsample", "held_out"} <= set(shown(form))
+    assert not {"sigma", "scene_width", "learning_rate", "levels"} & set(shown(form))
+    form.set_choices({"encoding": "fourier"})
+    assert {"sigma", "features", "scene_width", "learning_rate"} <= set(shown(form))
+    assert not {"smoothness", "levels", "motion_width"} & set(shown(form))
+    form.set_choices({"preset": "paper"})
+    assert "motion_width" in set(shown(form))
+    assert "canvas" not in set(shown(form))
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_every_choice_shows_every_knob_it_has(form, motion, encoding):
+    form._motion.setCurrentText(motion)
+    form._encoding.setCurrentText(encoding)
+    if form.problem:
+        assert "needs a network encoding" in form.problem
+        assert not form._hint.isHidden()
+    else:
+        wanted = set(choose(motion=motion, encoding=encoding).knobs) - {"preview_every", "device"}
+        assert set(shown(form)) == wanted
+
+
+def test_a_preset_sets_everything_back(form):
+    form.set_choices({"motion": "affine", "upsample": 3.0})
+    form._preset.setCurrentText("paper")
+    assert form.choices() == {"preset": "paper"}
+    form._preset.setCurrentText("auto")
+    assert form.choices() == {}
+
+
+def test_tooltips_are_the_settings_own_words(form):
+    knob = choose().knobs["upsample"]
+    assert knob.doc in form._rows["upsample"].toolTip()
+    tips = [form._encoding.itemData(row, Qt.ItemDataRole.ToolTipRole) for row in range(form._encoding.count())]
+    assert tips == [choice.__doc__.splitlines()[0] for choice in ENCODINGS.values()]
+
+
+def test_an_open_knob_shows_what_was_chosen_and_stays_open(form):
+    form.set_choices({"encoding": "fourier"})
+    form.show_chosen(choose(encoding="fourier", sigma=3.25))
+    assert form._rows["sigma"]._auto.text() == "auto (3.25)"
+    assert "sigma" not in form.choices()
+    form._rows["sigma"]._auto.setChecked(False)
+    assert form.choices()["sigma"] == 3.25
+
+
+def test_small_and_large_numbers_can_be_typed(form, qtbot):
+    form.set_choices({"encoding": "fourier", "learning_rate": 1e-4})
+    editor = form._rows["learning_rate"]._editor
+    assert editor.text() == "0.0001"
+    editor.lineEdit().setText("3e-5")
+    editor.interpretText()
+    assert form.choices()["learning_rate"] == 3e-5
+
+
+def test_a_missing_device_is_locked_with_its_reason(form):
+    form.show_devices({"cuda": "no driver", "mps": "no Apple computer"})
+    items = {form._device.itemText(row): form._device.model().item(row) for row in range(form._device.count())}
+    assert not items["cuda"].isEnabled()
+    assert items["cuda"].toolTip() == "no driver"
+    assert items["cpu"].isEnabled()
+
+
+def test_choices_of_another_version_are_left_out(form):
+    form.set_choices({"no_such_knob": 3})
+    assert form.choices() == {}
+
+
+def test_changed_preferences_win_over_what_was_left():
+    usual = Preferences()
+    assert remembered(usual) == {"preset": "auto"}
+    remember({"motion": "affine"}, usual)
+    assert remembered(usual) == {"motion": "affine"}
+    assert remembered(Preferences(preset="paper", device="cpu")) == {"preset": "paper", "device": "cpu"}

@@ -1,0 +1,55 @@
+"""The real window, as a newcomer uses it: File > Open Sample, Plugins > Fiber burst reconstruction, Start.
+
+The pictures in docs/ come from here: `make screenshots`.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from npe2 import PluginManifest
+from qtpy.QtGui import QAction
+from qtpy.QtWidgets import QMenu
+from skimage.io import imread
+
+
+def trigger(window: QMenu, *path: str) -> None:
+    """Choose an entry of a menu as a user does: by its words."""
+    menu = window
+    for words in path:
+        menu.aboutToShow.emit()
+        action: QAction = next(action for action in menu.actions() if action.text().replace("&", "").startswith(words))
+        menu = action.menu()
+    action.trigger()
+
+
+def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path):
+    npe2pm.register(PluginManifest.from_distribution("napari-fiberburst"))
+    viewer = make_napari_viewer(show=True)
+    trigger(viewer.window.file_menu, "Open Sample", "Fiberburst", "Histology, one value a core")
+    trigger(viewer.window.plugins_menu, "Fiber burst reconstruction")
+    (dock,) = viewer.window.dock_widgets.values()
+    before = viewer.window.screenshot(canvas_only=True, flash=False)
+    with qtbot.waitSignal(dock.display.complete, timeout=120_000):
+        dock.start_button.click()
+    qtbot.wait(200)
+    after = viewer.window.screenshot(canvas_only=True, flash=False)
+    assert dock.runs.run.result.ending == "finished"
+    # The honeycomb's dark gaps are gone from what is on the screen.
+    assert dark(after) < 0.5 * dark(before)
+    folder = Path(os.environ.get("FIBERBURST_SCREENSHOTS", tmp_path))
+    for theme in ("dark", "light"):
+        viewer.theme = theme
+        for width, height in ((1280, 800), (1920, 1080)):
+            viewer.window.resize(width, height)
+            viewer.reset_view()
+            qtbot.wait(300)
+            path = folder / f"plugin_{theme}_{width}x{height}.png"
+            viewer.window.screenshot(str(path), canvas_only=False, flash=False)
+            assert imread(path).shape[:2] == (height, width)
+    viewer.window.remove_dock_widget("all")
+
+
+def dark(picture: np.ndarray) -> float:
+    """Return how much of a picture is nearly black."""
+    return float((picture[..., :3].max(axis=-1) < 40).mean())
