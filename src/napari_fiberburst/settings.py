@@ -165,6 +165,19 @@ class Settings:
         used = {name: knob for name, knob in own.items() if name not in idle}
         return {**knobs_of(type(self.motion)), **knobs_of(type(self.encoding)), **used}
 
+    def value_of(self, name: str) -> Any:
+        """Return what a knob is turned to, be it of the motion, the encoding or the rest.
+
+        Raises
+        ------
+        SettingsError
+            There is no such knob with the motion and encoding chosen.
+        """
+        for part in (self.encoding, self.motion, self):
+            if name in knobs_of(type(part)):
+                return getattr(part, name)
+        raise SettingsError(_misplaced(name, self, self.motion, self.encoding))
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values that JSON can hold; `from_dict` reads them back."""
         plain = asdict(self)

@@ -110,16 +110,10 @@ class BurstSource:
     @property
     def frames(self) -> Any:
         """The burst as it came, (T, H, W) or (T, H, W, C), the region alone; lazy where the layer's data are."""
-        axes, data = self.axes, self.arrays[0]
-        if len(self.arrays) > 1:
-            axes, data = axes + "C", np.stack(self.arrays, axis=-1)
-        for axis in [axis for axis in axes if axis not in "TYXC"]:
-            data, axes = data[(slice(None),) * axes.index(axis) + (0,)], axes.replace(axis, "")
-        data = data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
         if self.region is None:
-            return data
+            return self._whole()
         (y0, y1), (x0, x1) = self.region
-        return data[:, y0:y1, x0:x1]
+        return self._whole()[:, y0:y1, x0:x1]
 
     def read(self) -> Burst:
         """Make the burst; may take as long as reading the file does.
@@ -129,25 +123,27 @@ class BurstSource:
         BurstError
             The layers are no usable burst.
         """
-        axes, data = self.axes, self.arrays[0]
-        if len(self.arrays) > 1:
-            if "C" in axes or any(array.shape != data.shape for array in self.arrays):
-                raise BurstError(
-                    "layers that are channels of one burst must be grey and of one shape; got "
-                    + ", ".join(f"{name} {tuple(array.shape)}" for name, array in self._named())
-                )
-            axes, data = axes + "C", np.stack([np.asarray(array) for array in self.arrays], axis=-1)
         burst = Burst(
-            data,
-            axes=axes,
+            self._whole(),
             channel_names=self.names if len(self.arrays) > 1 else (),
             pixel_size=self.pixel_size,
             unit=self.unit,
         )
         return burst if self.region is None else burst.crop(*self.region)
 
-    def _named(self) -> list[tuple[str, Any]]:
-        return list(zip(self.names, self.arrays, strict=True))
+    def _whole(self) -> Any:
+        """Return all of every frame, (T, H, W) or (T, H, W, C), in the layers' own type."""
+        axes, data = self.axes, self.arrays[0]
+        if len(self.arrays) > 1:
+            if "C" in axes or any(array.shape != data.shape for array in self.arrays):
+                shapes = [f"{name} {tuple(array.shape)}" for name, array in zip(self.names, self.arrays, strict=True)]
+                raise BurstError(
+                    f"layers that are channels of one burst must be grey and of one shape; got {', '.join(shapes)}"
+                )
+            axes, data = axes + "C", np.stack(self.arrays, axis=-1)
+        for axis in [axis for axis in axes if axis not in "TYXC"]:
+            data, axes = data[(slice(None),) * axes.index(axis) + (0,)], axes.replace(axis, "")
+        return data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
 
 
 def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) -> BurstSource:

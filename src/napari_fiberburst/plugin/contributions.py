@@ -4,6 +4,7 @@ Imported when napari starts to use one of them; loads neither torch nor, before 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,54 +50,17 @@ def make_sample(scene: str, physics: str) -> list[LayerData]:
     return [(frames[..., 0] if is_grey else frames, look, "image")]
 
 
-def histology_mask() -> list[LayerData]:
-    """Sample: stained tissue, dimmed by the bundle."""
-    return make_sample("histology", "mask")
-
-
-def histology_core() -> list[LayerData]:
-    """Sample: stained tissue, one value a core."""
-    return make_sample("histology", "core")
-
-
-def retina_mask() -> list[LayerData]:
-    """Sample: the back of an eye, dimmed by the bundle."""
-    return make_sample("retina", "mask")
-
-
-def retina_core() -> list[LayerData]:
-    """Sample: the back of an eye, one value a core."""
-    return make_sample("retina", "core")
-
-
-def usaf_mask() -> list[LayerData]:
-    """Sample: a resolution chart, dimmed by the bundle."""
-    return make_sample("usaf", "mask")
-
-
-def usaf_core() -> list[LayerData]:
-    """Sample: a resolution chart, one value a core."""
-    return make_sample("usaf", "core")
-
-
-def tissue_mask() -> list[LayerData]:
-    """Sample: fibrous tissue, dimmed by the bundle."""
-    return make_sample("tissue", "mask")
-
-
-def tissue_core() -> list[LayerData]:
-    """Sample: fibrous tissue, one value a core."""
-    return make_sample("tissue", "core")
-
-
-def cat_mask() -> list[LayerData]:
-    """Sample: a cat, dimmed by the bundle."""
-    return make_sample("cat", "mask")
-
-
-def cat_core() -> list[LayerData]:
-    """Sample: a cat, one value a core."""
-    return make_sample("cat", "core")
+# napari calls a sample by a name of its own, without arguments.
+histology_mask = partial(make_sample, "histology", "mask")
+histology_core = partial(make_sample, "histology", "core")
+retina_mask = partial(make_sample, "retina", "mask")
+retina_core = partial(make_sample, "retina", "core")
+usaf_mask = partial(make_sample, "usaf", "mask")
+usaf_core = partial(make_sample, "usaf", "core")
+tissue_mask = partial(make_sample, "tissue", "mask")
+tissue_core = partial(make_sample, "tissue", "core")
+cat_mask = partial(make_sample, "cat", "mask")
+cat_core = partial(make_sample, "cat", "core")
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:

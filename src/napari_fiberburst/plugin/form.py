@@ -83,7 +83,7 @@ class SettingsForm(QWidget):
                 named[part] = box.currentText()
         base = choose(**named)
         values = {name: self._value(name) for name in base.knobs if name not in (*_NOT_SHOWN, "observation")}
-        turned = {name: value for name, value in values.items() if value is not None and value != _own(base, name)}
+        turned = {name: value for name, value in values.items() if value is not None and value != base.value_of(name)}
         choose(**named, **turned)
         return {**named, **turned}
 
@@ -102,7 +102,7 @@ class SettingsForm(QWidget):
         """Say what a run has chosen for knobs that were left open."""
         for name, row in self._rows.items():
             if row.knob.optional and name in settings.knobs:
-                row.show_chosen(_own(settings, name))
+                row.show_chosen(settings.value_of(name))
 
     def set_running(self, is_running: bool, *, is_network: bool = False) -> None:
         """Lock all but what a running fit follows; sigma and the learning rate are a network's."""
@@ -231,8 +231,8 @@ class SettingsForm(QWidget):
         base = choose(self.preset, observation=settings.observation, **named)
         for name in settings.knobs:
             if name in self._rows:
-                self._rows[name].set_value(_own(settings, name))
-                self._rows[name].allow_open(_own(base, name) is None)
+                self._rows[name].set_value(settings.value_of(name))
+                self._rows[name].allow_open(base.value_of(name) is None)
 
     def _value(self, name: str) -> Any:
         return self._device.currentText() if name == "device" else self._rows[name].value
@@ -241,11 +241,3 @@ class SettingsForm(QWidget):
 def _all_knobs() -> dict[str, Knob]:
     owners = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
     return {name: knob for owner in owners for name, knob in knobs_of(owner).items()}
-
-
-def _own(settings: Settings, name: str) -> Any:
-    """Return a knob's value, wherever in the settings it is."""
-    for part in (settings.encoding, settings.motion, settings):
-        if name in knobs_of(type(part)):
-            return getattr(part, name)
-    raise SettingsError(f"{name} is no setting")

@@ -80,9 +80,9 @@ class RunLayers:
         # The first layer of shapes can take seconds to come: the picture goes first, and is seen.
         if not self._layers or time.perf_counter() - self._outlined < wait:
             return
-        began = time.perf_counter()
+        began, before = time.perf_counter(), len(self._layers)
         for _ in self._put_frames(homographies, shape):
-            if not {_OUTLINES, _CENTRES} <= set(self._layers):
+            if len(self._layers) > before:
                 break  # the other layer next time: each new one holds up the window
         self._outlined = time.perf_counter()
         self._outlining = self._outlined - began

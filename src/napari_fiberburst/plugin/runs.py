@@ -110,7 +110,7 @@ class RunsPanel(QWidget):
         self._is_running = False
         self._list = QListWidget()
         self._list.setMaximumHeight(_LINES_OF_RUNS * self.fontMetrics().height() + 16)
-        self._list.setToolTip("The runs of this session; double-click one to name it.")
+        self._list.setToolTip("The runs so far; double-click one to name it.")
         self._summary = QLabel()
         self._summary.setWordWrap(True)
         self._summary.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
