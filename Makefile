@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo gui test coverage lint bench bench-quality bench-plugin screenshots clean
+.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin peers docs docs-pictures docs-results screenshots clean
 
 demo: .venv/base
 	mkdir -p demo
@@ -31,14 +31,22 @@ lint: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/npe2 validate src/napari_fiberburst/napari.yaml
 
-bench: .venv/base
+# Every table and figure of the documentation: some 80 minutes on two cores. BURST=FOLDER adds the real burst's table;
+# MORE passes anything else on: make bench MORE=--resume
+bench: .venv/bench .venv-peers/made
+	$(BIN)/python -m benchmarks $(if $(BURST),--burst $(BURST)) $(MORE)
+
+bench-quick: .venv/bench
+	$(BIN)/python -m benchmarks --quick --results benchmarks/results-quick --overwrite $(MORE)
+
+# What a change of the code may cost: a step, memory, startup.
+bench-code: .venv/base
 	$(BIN)/python benchmarks/step.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/startup.py
-	$(BIN)/python benchmarks/speed.py
 
-bench-quality: .venv/base
-	$(BIN)/python benchmarks/quality.py
+# PyFibreBundle, away from napari: its OpenCV brings another Qt.
+peers: .venv-peers/made
 
 # In a window that is drawn: without a display, under xvfb-run.
 bench-plugin: .venv/gui
@@ -49,8 +57,22 @@ screenshots: .venv/dev
 	rm docs/plugin_light_1920x1080.png docs/plugin_dark_1920x1080.png
 	$(BIN)/python examples/record_the_plugin.py docs/plugin.gif
 
+# The site, in site/; what is wrong in it is an error.
+docs: .venv/docs
+	$(BIN)/python -m mkdocs build --strict --quiet
+
+# What the site shows of the examples, and of the latest `make bench`.
+docs-pictures: .venv/bench
+	mkdir -p docs/gallery
+	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence where_it_fails; do \
+	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done
+	cd docs/gallery && rm -f cat.ome.tif cat.json
+
+docs-results: .venv/bench
+	$(BIN)/python -m benchmarks.publish docs/results
+
 clean:
-	rm -rf .venv demo .coverage .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv .venv-peers demo site .coverage .mypy_cache .pytest_cache .ruff_cache
 
 .venv/base: pyproject.toml constraints.txt | .venv/pip
 	$(PIP) --editable .
@@ -58,6 +80,19 @@ clean:
 
 .venv/gui: pyproject.toml constraints.txt | .venv/pip
 	$(PIP) --editable . --group gui
+	@touch $@
+
+.venv/bench: pyproject.toml constraints.txt | .venv/pip
+	$(PIP) --editable . --group bench
+	@touch $@
+
+.venv/docs: pyproject.toml constraints.txt | .venv/pip
+	$(PIP) --editable . --group docs
+	@touch $@
+
+.venv-peers/made:
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet PyFibreBundle==1.3.6
 	@touch $@
 
 .venv/dev: pyproject.toml constraints.txt | .venv/pip

@@ -1,0 +1,87 @@
+"""Tables 1 and 3: every method on every burst, scored against the truth in two ways.
+
+PSNR and SSIM are of frame 0, every pixel. "Matched" is after the one gain and offset per channel that bring the
+picture closest to the truth: a bundle passes only part of the light, and how large a part no burst can tell, so that
+only what is left then tells of quality. "As given" is without: it is what the paper prints of a captured frame, and
+mostly tells how dark a method leaves its picture.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from benchmarks.cases import Case
+from benchmarks.methods import METHODS, Effort, Outcome, PeerError
+from benchmarks.results import Results, Row
+from napari_fiberburst.quality import match_levels, motion_error, psnr, ssim
+from napari_fiberburst.simulation import SimulatedBurst
+
+# What the third table leaves out: two methods whose work on 24 bursts would take hours.
+SLOW = ("inpainting", "paper")
+
+
+def compare(
+    results: Results, table: str, cases: Sequence[Case], methods: Sequence[str], effort: Effort, *, pictures: bool
+) -> None:
+    """Fill the rows of a table; `pictures` keeps what each method draws, and the truth."""
+    for case in cases:
+        print(case, flush=True)
+        if pictures:
+            results.row(table, case.name, "truth", lambda case=case: {"picture": case.make().truth[0]})  # type: ignore[misc]
+        for name in methods:
+            row = results.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures))  # noqa: B023
+            print(f"  {METHODS[name].label:34} {in_words(row)}", flush=True)
+
+
+def measure(case: Case, name: str, effort: Effort, *, pictures: bool) -> Row:
+    """Return one row."""
+    simulated = case.make()
+    told = {"burst": asdict(case)}
+    try:
+        outcome = METHODS[name].run(case, simulated, effort)
+    except PeerError as error:
+        return {**told, "missing": str(error)}
+    row = {**told, **score(outcome, simulated)}
+    if pictures:
+        row["picture"] = match_levels(outcome.picture, simulated.truth[0])
+    return row
+
+
+def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
+    """Return how close a picture and its motion come to the truth."""
+    truth, picture = simulated.truth[0], np.nan_to_num(outcome.picture)
+    row: Row = {
+        "psnr": psnr(picture, truth),
+        "ssim": ssim(picture, truth),
+        **as_given(picture, truth),
+        "seconds": outcome.seconds,
+        "compression": outcome.compression,
+        "curve": outcome.curve,
+        "notes": outcome.notes,
+    }
+    if outcome.homographies is not None:
+        row["motion_error"] = motion_error(outcome.homographies, simulated.homographies, truth.shape[:2])
+        row["frames_used"] = int(np.isfinite(outcome.homographies).all(axis=(1, 2)).sum())
+    return row
+
+
+def as_given(picture: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:
+    """Return PSNR and SSIM of a picture as it is, 1 as full scale."""
+    exact, shown = np.asarray(truth, np.float64), np.asarray(picture, np.float64)
+    return {
+        "psnr_as_given": float(peak_signal_noise_ratio(exact, shown, data_range=1)),
+        "ssim_as_given": float(structural_similarity(exact, shown, data_range=1, channel_axis=2)),
+    }
+
+
+def in_words(row: Row) -> str:
+    """Return a row as a line to follow a run by."""
+    if "missing" in row:
+        return str(row["missing"])
+    line = (
+        f"{row['psnr']:6.2f} dB  {row['ssim']:.3f}  (as given {row['psnr_as_given']:6.2f} dB)  {row['seconds']:7.1f} s"
+    )
+    return line + (f"  motion off by {row['motion_error']:.3f} px" if row.get("motion_error") is not None else "")

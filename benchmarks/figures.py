@@ -1,0 +1,159 @@
+"""Figures, by matplotlib, from the rows and pictures of a results folder."""
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.figure import Figure
+
+from benchmarks.methods import METHODS
+from benchmarks.results import ABLATION, CONDITIONS, REAL, SCENES, Results
+
+DOTS_PER_INCH = 110
+# One colour a method in all figures (Okabe and Ito, 2008: told apart by all eyes).
+COLOURS = (
+    "#999999",
+    "#56B4E9",
+    "#8FC7EA",
+    "#CC79A7",
+    "#E69F00",
+    "#B97E00",
+    "#F0E442",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#000000",
+)
+
+
+def draw(results: Results) -> None:
+    """Draw all figures whose rows are there."""
+    mpl.use("Agg")
+    for name, make in (
+        ("scenes", _scenes),
+        ("convergence", _convergence),
+        ("conditions", _conditions),
+        ("real", _real),
+        ("profiles", _profiles),
+    ):
+        figure = make(results)
+        if figure is not None:
+            path = results.folder / "figures" / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, dpi=DOTS_PER_INCH, bbox_inches="tight")
+            plt.close(figure)
+
+
+def colour(method: str) -> str:
+    """Return a method's colour."""
+    return COLOURS[list(METHODS).index(method)]
+
+
+def _scenes(results: Results) -> Figure | None:
+    rows = {(row["case"], row["method"]): row for row in results.rows(SCENES)}
+    cases = sorted({case for case, _ in rows}, key=lambda case: rows.get((case, "truth"), {}).get("date", ""))
+    columns = [name for name in ("truth", *METHODS) if any(method == name for _, method in rows)]
+    if not cases:
+        return None
+    figure, axes = plt.subplots(
+        len(cases), len(columns), figsize=(1.9 * len(columns), 2.2 * len(cases)), squeeze=False, layout="constrained"
+    )
+    for across, case in zip(axes, cases, strict=True):
+        for axis, method in zip(across, columns, strict=True):
+            picture = results.picture(SCENES, case, method)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if picture is not None:
+                axis.imshow(picture, cmap="gray", vmin=0, vmax=255)
+            row = rows.get((case, method), {})
+            axis.set_xlabel(f"{row['psnr']:.1f} dB" if "psnr" in row else row.get("missing", "")[:14], fontsize=8)
+            if across is axes[0]:
+                axis.set_title(
+                    METHODS[method].label.replace(", ", "\n") if method in METHODS else "truth", fontsize=7.5
+                )
+        across[0].set_ylabel(case, fontsize=9)
+    return figure
+
+
+def _convergence(results: Results) -> Figure | None:
+    rows = [row for row in results.rows(ABLATION) if row["curve"]]
+    if not rows:
+        return None
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True, layout="constrained")
+    for axis, is_motion in zip(axes, (True, False), strict=True):
+        shown = [
+            row
+            for row in rows
+            if (row["encoding"] == "fourier" if is_motion else row["motion"] == "homography")
+            or row["encoding"] == "spline"
+        ]
+        names = list(dict.fromkeys(row["motion" if is_motion else "encoding"] for row in shown))
+        for row in shown:
+            name = row["motion" if is_motion else "encoding"]
+            kind = "spline, " if row["encoding"] == "spline" else ""
+            label = f"{kind}{name}, {'with' if row['bundle_model'] else 'without'} bundle model"
+            curve = np.array([*row["curve"], (row["seconds"], row["psnr"])])
+            style = ":" if kind else "-" if row["bundle_model"] else "--"
+            axis.plot(*curve.T, style, color=f"C{names.index(name)}", label=label, linewidth=1.4)
+        axis.set(xlabel="seconds", xscale="log", title="motion" if is_motion else "encoding")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=6)
+    axes[0].set_ylabel("PSNR, dB")
+    return figure
+
+
+def _conditions(results: Results) -> Figure | None:
+    rows = [row for row in results.rows(CONDITIONS) if "psnr" in row]
+    if not rows:
+        return None
+    cases = list(dict.fromkeys(row["case"] for row in sorted(rows, key=lambda row: row["date"])))
+    figure, axis = plt.subplots(figsize=(8, 0.28 * len(cases) + 1.2), layout="constrained")
+    for method in METHODS:
+        own = [row for row in rows if row["method"] == method]
+        if own:
+            places = [cases.index(row["case"]) for row in own]
+            marker = "D" if method == "default" else "|" if method == "oracle" else "o"
+            axis.plot(
+                [row["psnr"] for row in own], places, marker, color=colour(method), label=METHODS[method].label,
+                markersize=11 if marker == "|" else 6, markeredgewidth=2 if marker == "|" else 0.5,
+            )  # fmt: skip
+    axis.set_yticks(range(len(cases)), cases, fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("PSNR, dB")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    return figure
+
+
+def _real(results: Results) -> Figure | None:
+    found = {row["method"]: row for row in results.rows(REAL) if "elements" in row}
+    names = [name for name in METHODS if name in found]
+    if not names:
+        return None
+    figure, axes = plt.subplots(1, len(names), figsize=(3.1 * len(names), 3.9), squeeze=False, layout="constrained")
+    for axis, name in zip(axes[0], names, strict=True):
+        picture = results.picture(REAL, "chart", name)
+        assert picture is not None
+        axis.imshow(picture[380:860, 90:390], cmap="gray", vmin=0, vmax=255)  # group 7
+        axis.set_title(
+            f"{METHODS[name].label}\nM {found[name]['modulation']:.2f}, ring {found[name]['ring_db']:.0f} dB",
+            fontsize=8,
+        )
+        axis.axis("off")
+    return figure
+
+
+def _profiles(results: Results) -> Figure | None:
+    found = {row["method"]: row for row in results.rows(REAL) if "profiles" in row}
+    names = [name for name in METHODS if name in found]
+    if not names:
+        return None
+    elements = list(found[names[0]]["profiles"])
+    figure, axes = plt.subplots(1, len(elements), figsize=(11, 3), sharey=True, layout="constrained")
+    for axis, element in zip(np.atleast_1d(axes), elements, strict=True):
+        for name in names:
+            axis.plot(*found[name]["profiles"][element], color=colour(name), label=METHODS[name].label, linewidth=1.4)
+        axis.set(xlabel="pixels across the bars", title=element)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("light, chart's dark = 0, glass = 1")
+    axes[-1].legend(fontsize=7)
+    return figure

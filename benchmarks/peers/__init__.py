@@ -1,0 +1,1 @@
+"""Methods to compare with: published ones, and ones that anybody would try first."""

@@ -1,0 +1,105 @@
+"""PyFibreBundle (Hughes, 2023), the package itself, run as a script by a Python that has it.
+
+It lives in an environment of its own, for its OpenCV brings a Qt that clashes with napari's; so this file imports
+nothing of this project. It reads an npz and writes one:
+
+    .venv-peers/bin/python benchmarks/peers/pyfibrebundle.py single|super IN.npz OUT.npz
+
+In: `frames` (T, H, W, C) and `bundle` (H, W), an even white scene behind the same bundle, both with 1 as full scale
+and black at 0; `centres` (N, 2), the true layout, or none, and then the package finds cores `pitch` apart itself;
+`x`, `y` and `size`: the square of frame 0 to draw, pixels, and `grid`, its pixels a side. Out: `picture` (grid, grid,
+C) and `seconds`, which leave out starting Python.
+"""
+
+import sys
+import time
+
+import numpy as np
+import pybundle
+from pybundle import SuperRes
+from scipy.ndimage import distance_transform_edt
+
+
+def single_calibration(told):
+    """Calibrate for one frame: where the cores are, and how bright each is."""
+    half = (float(told["size"]) - 1) / 2
+    centre_x, centre_y, grid = float(told["x"]) + half, float(told["y"]) + half, int(told["grid"])
+    look = {"filterSize": None, "normalise": told["bundle"], "mask": False}
+    if "centres" not in told:
+        return pybundle.calib_tri_interp(
+            told["bundle"],
+            float(told["pitch"]),
+            grid,
+            centreX=centre_x,
+            centreY=centre_y,
+            radius=half,
+            autoMask=True,
+            **look,
+        )
+    height, width = told["bundle"].shape
+    places = np.rint(told["centres"]).astype(int)
+    inside = ((places >= 0) & (places < (width, height))).all(axis=1)
+    x, y = places[inside].astype("uint16").T
+    lit = told["bundle"][y, x] > 0.05  # dead cores are known too
+    calibration = pybundle.init_tri_interp(told["bundle"], x[lit], y[lit], centre_x, centre_y, half, grid, **look)
+    calibration.nCores = int(lit.sum())
+    return calibration
+
+
+def one_frame(told, calibration):
+    """Interpolate between the cores of frame 0."""
+    channels = np.moveaxis(told["frames"][0], -1, 0)
+    pictures = [pybundle.recon_tri_interp(channel, calibration, numba=False) for channel in channels]
+    # What is normalised comes with 255 as full scale.
+    return filled(np.stack(pictures, axis=-1) / 255, calibration)
+
+
+def all_frames(told, calibration):
+    """Register the frames by translation, as the package does, and interpolate between the cores of all."""
+    stacks = np.moveaxis(told["frames"], 0, 2)  # (H, W, T, C)
+    grid, half = int(told["grid"]), calibration.radius
+    drawn = [
+        pybundle.recon_tri_interp(stacks[..., t, :].mean(axis=-1), calibration, numba=False)
+        for t in range(stacks.shape[2])
+    ]
+    shifts = SuperRes.get_shifts(np.stack(drawn, axis=-1), templateSize=grid // 4, refSize=grid // 2, upsample=4)
+    shifts = np.asarray(shifts, float) * 2 * half / grid
+    centre = {"centreX": told["x"] + half, "centreY": told["y"] + half, "radius": half}
+    pictures = []
+    for channel in range(stacks.shape[3]):
+        combined = SuperRes.calib_multi_tri_interp(
+            told["bundle"],
+            stacks[..., channel],
+            float(told["pitch"]),
+            grid,
+            shifts=shifts,
+            singleCalib=calibration,
+            filterSize=calibration.filterSize,
+            mask=False,
+            normToImage=True,
+            **centre,
+        )
+        pictures.append(SuperRes.recon_multi_tri_interp(stacks[..., channel], combined, numba=False))
+    return filled(np.stack(pictures, axis=-1), combined)
+
+
+def filled(picture, calibration):
+    """Fill what lies beyond the outermost cores with what is nearest: the package leaves it black."""
+    missing = (calibration.mapping < 0).reshape(picture.shape[:2]) | ~np.isfinite(picture).all(axis=-1)
+    rows, columns = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    return picture[rows, columns]
+
+
+def main():
+    """Read, reconstruct, write."""
+    method, given, wanted = sys.argv[1:]
+    with np.load(given) as file:
+        told = {name: file[name] for name in file.files}
+    start = time.perf_counter()
+    picture = {"single": one_frame, "super": all_frames}[method](told, single_calibration(told))
+    seconds = time.perf_counter() - start
+    np.savez(wanted, picture=picture.astype(np.float32), seconds=seconds)
+
+
+if __name__ == "__main__":
+    main()

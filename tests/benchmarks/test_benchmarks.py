@@ -1,0 +1,202 @@
+"""The benchmark: its folder of rows, its methods, its reading of the chart; and what it says to bad calls."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.cases import Case
+from benchmarks.chart import PLACES, Shown, period_of
+from benchmarks.compare import compare
+from benchmarks.methods import METHODS, Effort, PeerError
+from benchmarks.results import CONDITIONS, SCENES, Results
+
+from benchmarks import __main__ as command
+from benchmarks import cases, chart, methods, report
+from napari_fiberburst.errors import OutputError, SettingsError
+from napari_fiberburst.quality import psnr
+from napari_fiberburst.reconstruction import Canvas
+
+SMALL = Case(name="small", scene="cat", side=80, pitch=4.0, frames=6, seed=3)
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path):
+    computed = []
+
+    def compute(number):
+        computed.append(number)
+        return {"psnr": float(number)}
+
+    first = Results(tmp_path, "quick")
+    for number in range(3):
+        first.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
+    again = Results(tmp_path, "quick", resume=True)
+    for number in range(5):
+        row = again.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
+        assert row["psnr"] == number
+    assert computed == [0, 1, 2, 3, 4]
+    assert [row["case"] for row in again.rows(SCENES)] == [f"case {number}" for number in range(5)]
+
+
+def test_results_are_not_overwritten_unasked(tmp_path):
+    Results(tmp_path, "quick").row(SCENES, "a", "default", lambda: {"psnr": 1.0, "picture": np.zeros((5, 7))})
+    with pytest.raises(OutputError, match=r"--resume goes on with them, --overwrite"):
+        Results(tmp_path, "quick")
+    with pytest.raises(OutputError, match="name another folder"):
+        Results(tmp_path, "full", resume=True)
+    emptied = Results(tmp_path, "full", overwrite=True)
+    assert list(emptied.rows(SCENES)) == []
+    assert emptied.picture(SCENES, "a", "default") is None
+    assert emptied.about["mode"] == "full"
+
+
+def test_every_row_says_where_it_came_from(tmp_path):
+    results = Results(tmp_path, "quick")
+    compare(results, CONDITIONS, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=False)
+    for row in results.rows(CONDITIONS):
+        assert row["burst"]["seed"] == 3
+        assert row["date"] >= "2026"
+        assert "commit" in row
+    assert {"torch", "numpy"} <= set(results.about["versions"])
+
+
+def test_a_peer_that_is_missing_has_its_row(tmp_path, monkeypatch):
+    monkeypatch.setattr(methods, "PEER_PYTHON", tmp_path / "no python")
+    results = Results(tmp_path, "quick")
+    compare(results, SCENES, [SMALL], ["captured", "pyfibrebundle"], Effort(), pictures=True)
+    tables = report.write(results).read_text(encoding="utf-8")
+    assert "not installed: make peers" in tables
+    assert "captured frame" in tables
+
+
+def test_a_peer_that_breaks_has_its_row_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(methods, "PEER_PYTHON", Path(sys.executable))  # which has no such package
+    with pytest.raises(PeerError, match="No module named 'pybundle'"):
+        METHODS["pyfibrebundle"].run(SMALL, SMALL.make(), Effort())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--methods", "magic"], "unknown method 'magic'; known: captured, gaussian"),
+        (["--scenes", "moon"], "unknown case 'moon'; known: liver, kidney"),
+        (["--tables", "4", "--burst", "nowhere"], "expected burst.tif in nowhere"),
+    ],
+)
+def test_bad_calls_name_what_there_is(arguments, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments, "--results", str(tmp_path / "new")])
+    assert command.main() == 2
+    assert words in capsys.readouterr().err
+
+
+def test_cases_can_be_found_by_name():
+    assert [case.name for case in cases.find(["chart"], cases.comparison())] == ["chart"]
+    with pytest.raises(SettingsError, match="known: as it is"):
+        cases.find(["?"], cases.conditions())
+
+
+def test_the_same_recipe_gives_the_same_burst():
+    one, two = SMALL.make(), Case(name="other", scene="cat", side=80, pitch=4.0, frames=6, seed=3).make()
+    np.testing.assert_array_equal(one.burst.frames, two.burst.frames)
+
+
+def test_fewer_and_shuffled_frames_keep_their_truth():
+    whole = SMALL.make()
+    few = Case(**{**vars_of(SMALL), "keep": 2}).make()
+    np.testing.assert_array_equal(few.burst.frames, whole.burst.frames[:2])
+    mixed = Case(**{**vars_of(SMALL), "order": "shuffled"}).make()
+    where = [next(t for t in range(6) if np.array_equal(frame, whole.burst.frames[t])) for frame in mixed.burst.frames]
+    assert sorted(where) == list(range(6))
+    assert where != list(range(6))
+    np.testing.assert_array_equal(mixed.homographies, whole.homographies[where])
+    single = Case(**{**vars_of(SMALL), "keep": 1}).make()
+    np.testing.assert_array_equal(single.burst.frames[0], single.burst.frames[1])
+
+
+def vars_of(case):
+    return {name: getattr(case, name) for name in case.__dataclass_fields__}
+
+
+def test_the_methods_draw_frame_0_and_the_best_is_ours():
+    case = Case(name="twelve frames", scene="cat", side=80, pitch=4.0, frames=12, seed=3)
+    simulated = case.make()
+    truth = simulated.truth[0]
+    quality = {}
+    for name in ("captured", "gaussian", "gaussian-fixed", "mean", "unet", "inpainting", "default", "oracle"):
+        outcome = METHODS[name].run(case, simulated, Effort(inpainting_steps=150))
+        assert outcome.picture.shape == truth.shape
+        quality[name] = psnr(outcome.picture, truth)
+    peers = {name: value for name, value in quality.items() if name not in ("default", "oracle")}
+    assert quality["captured"] == min(quality.values())
+    assert quality["gaussian"] >= quality["gaussian-fixed"]
+    assert quality["unet"] > quality["captured"] + 4
+    assert quality["inpainting"] > quality["captured"] + 4
+    assert quality["default"] > max(peers.values()) + 2
+    assert abs(quality["default"] - quality["oracle"]) < 1
+
+
+def test_the_trained_weights_are_small_enough_to_ship():
+    assert methods.unet.WEIGHTS.stat().st_size < 5 * 2**20
+
+
+def test_time_to_quality_takes_previews_into_account():
+    row = {"curve": [(1.0, 18.0), (2.0, 24.0)], "seconds": 9.0, "psnr": 30.0}
+    assert report.seconds_to(row, 20) == 2.0
+    assert report.seconds_to(row, 29) == 9.0
+    assert report.seconds_to(row, 31) is None
+
+
+@pytest.fixture(scope="module")
+def drawn_chart():
+    """Bars of a known contrast at the known places: dark 50, glass 150, bars of G7E6 at half the depth."""
+    picture = np.full(chart.FRAME, 150.0)
+    rows, columns = np.indices(chart.FRAME)
+    x, y, half = chart.SQUARE
+    picture[np.hypot(columns - x, rows - y) < 1.5 * half] = 50
+    for (group, element, bars), (x, y) in PLACES.items():
+        period = period_of(group, element)
+        cosine, sine = np.cos(chart.ANGLE), np.sin(chart.ANGLE)
+        across = (columns - x) * cosine + (rows - y) * sine
+        along = -(columns - x) * sine + (rows - y) * cosine
+        if bars == "H":
+            across, along = along, across
+        inside = (np.abs(along) < 1.25 * period) & (np.abs(across) < 1.3 * period)
+        depth = 50 if (group, element) == (7, 6) else 100
+        dark = inside & (np.abs(across / period - np.rint(across / period)) < 0.25)
+        picture[dark] = 150 - depth
+    return picture
+
+
+def test_the_chart_is_read_as_it_was_drawn(drawn_chart):
+    shown = Shown(drawn_chart, Canvas.over((0, 0, *chart.FRAME[::-1])))
+    np.testing.assert_allclose(shown.levels, (50, 150), atol=0.5)
+    found = {(row["group"], row["element"], row["bars"]): row for row in shown.elements()}
+    assert found[6, 1, "H"]["modulation"] == pytest.approx(1, abs=0.05)
+    assert found[7, 5, "V"]["modulation"] == pytest.approx(1, abs=0.15)
+    assert found[7, 6, "V"]["modulation"] == pytest.approx(0.5, abs=0.1)
+    assert chart.finest(list(found.values())) == "G7E6"
+
+
+def test_a_chart_without_bars_resolves_nothing(drawn_chart):
+    rng = np.random.default_rng(0)
+    blank = 150 + rng.normal(0, 5, chart.FRAME)
+    blank[588:623, 615:650] = 50
+    rows = list(Shown(blank, Canvas.over((0, 0, *chart.FRAME[::-1]))).elements())
+    assert chart.finest(rows) == "none"
+
+
+def test_a_lattice_shows_in_the_ring():
+    flat = np.full(chart.FRAME, 150.0)
+    flat[588:623, 615:650] = 50
+    honeycomb = flat + 10 * np.cos(2 * np.pi * chart.LATTICE * np.arange(chart.FRAME[1]))
+    canvas = Canvas.over((0, 0, *chart.FRAME[::-1]))
+    plain, dirty = Shown(flat, canvas).ring(), Shown(honeycomb, canvas).ring()
+    assert plain < 1e-6
+    assert dirty == pytest.approx(10 / np.sqrt(2) / 100, rel=0.1)
+
+
+def test_the_report_is_valid_where_little_is_there(tmp_path):
+    results = Results(tmp_path, "quick")
+    assert "Measured" in report.write(results).read_text(encoding="utf-8")
+    assert json.loads((tmp_path / "about.json").read_text())["mode"] == "quick"
