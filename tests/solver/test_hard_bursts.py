@@ -4,6 +4,7 @@ import logging
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst import Burst, load, reconstruct
 from napari_fiberburst.errors import BurstError, SettingsError
@@ -32,8 +33,10 @@ def test_without_motion_it_says_so_and_shows_one_frames_worth():
     simulated = simulate("cat", shape=SHAPE, frames=8, pitch=5.0, physics="core", motion=still_to(8))
     result = reconstruct(simulated.burst)
     assert any("too little to fill the gaps" in note for note in result.notes)
-    captured = psnr(simulated.burst.frames[0], simulated.truth[0])
-    assert psnr(np.nan_to_num(result.image, nan=np.nanmean(result.image)), simulated.truth[0]) > captured + 3
+    # What cores differ by is smoothed out: the picture is as good as the filter that the truth would choose.
+    frame, truth = simulated.burst.frames[0], simulated.truth[0]
+    filtered = max(psnr(gaussian_filter(frame, (width, width, 0)), truth) for width in np.arange(1, 6, 0.5))
+    assert psnr(np.nan_to_num(result.image, nan=np.nanmean(result.image)), truth) > filtered - 0.3
 
 
 def test_two_frames_are_enough():

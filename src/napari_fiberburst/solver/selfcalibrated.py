@@ -22,7 +22,8 @@ from napari_fiberburst.solver.evidence import bundle_evidence, fit_evidence
 from napari_fiberburst.solver.gains import refreshed
 from napari_fiberburst.solver.picture import SplinePicture
 from napari_fiberburst.solver.progress import Progress
-from napari_fiberburst.solver.spline import UNTOLD, Normal, Smoothness, assemble, choose_smoothness
+from napari_fiberburst.solver.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
+from napari_fiberburst.solver.spline import Normal, assemble
 
 # Rounds and stages that a fit has, about: what is left is told in these.
 _PLANNED = 27
@@ -144,10 +145,13 @@ class SelfCalibrated:
         aligned = self.alignment
         seen, points = aligned.observation, aligned.points()
         frames = np.flatnonzero(aligned.used)
-        if self._fixed is not None or aligned.is_still or len(frames) < 2:
-            self._smoothness = self._fixed or UNTOLD
+        if self._fixed is not None:
+            self._smoothness = self._fixed
+        elif aligned.is_still and seen.radius is None:
+            self._smoothness = UNTOLD
         else:
-            self._chosen = choose_smoothness(seen, points, frames, grid, scene.mean(dim=0))
+            choose = choose_among_neighbours if aligned.is_still else choose_smoothness
+            self._chosen = choose(seen, points, frames, grid, scene.mean(dim=0))
             self._smoothness = self._chosen.weight
         yield "smoothness chosen"
         held = self._held_out(seen)

@@ -13,26 +13,15 @@ detail that is there, which undoing a blur needs.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.geometry.footprint import Footprint
 from napari_fiberburst.geometry.grid import Grid, Stencil, blur, roughness
 from napari_fiberburst.optics.observation import Observation
-from napari_fiberburst.quality.resolution import ring_correlation
 
-# Smoothness is looked for among these, and between them.
-_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
-# A picture this rough has hardly any bias left: it stands for the truth that the other half's pictures are held to.
-_REFERENCE = 0.01
-# The smoothness where it cannot be told: halves of a still burst share every gap.
-UNTOLD = 0.1
-# Smoothness is chosen in a window of at most this many nodes a side.
-_WINDOW = 224
 _TOLERANCE = 1e-3
 _FREQUENCIES = 33
 
@@ -149,98 +138,3 @@ def assemble(grid: Grid, observation: Observation, points: Tensor, among: Tensor
             chosen = weights if among is None else weights * among[number]
             normal.add(points[number], observation.values[number], chosen)
     return normal
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Smoothness:
-    """How smooth the scene should be, and what resolution that gives.
-
-    Attributes
-    ----------
-    weight : float
-        lambda.
-    resolution : float or None
-        Pixels, the finest period on which two halves of the burst agree; None where that could not be told.
-    """
-
-    weight: float
-    resolution: float | None
-
-
-def choose_smoothness(
-    observation: Observation, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
-) -> Smoothness:
-    """Choose the smoothness by which each half of the burst best predicts the scene of the other.
-
-    Even and odd frames are solved apart. The squared difference between the scene from one half, at each smoothness,
-    and a nearly unbiased scene from the other is that scene's error plus a constant, for the halves' noise is
-    independent. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that matter.
-
-    Parameters
-    ----------
-    observation, points
-        What is seen, and where (T, N, 2).
-    frames : numpy.ndarray
-        Numbers of the frames that take part, at least two.
-    grid : Grid
-        Of the scene.
-    scene : Tensor
-        (H, W), a first scene on that grid: the window is laid where it has most structure.
-    """
-    window = _window(grid, scene)
-    grey = observation.values.mean(dim=2, keepdim=True)
-    halves = []
-    for chosen in (frames[::2], frames[1::2]):
-        normal = Normal(window, observation.radius, 1, points.device)
-        for number in chosen:
-            normal.add(points[number], grey[number], observation.weights[number])
-        halves.append(normal)
-    densities = [blur(half.density(), 3.0) for half in halves]
-    both = torch.minimum(*densities)
-    seen = (both > 0.2 * both.max()) & (both > 0)
-    if not bool(seen.any()):
-        return Smoothness(UNTOLD, None)
-    paths = [_path(half) for half in halves]
-    reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
-    risks = [
-        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, seen].mean())
-        for first, second in zip(*paths, strict=True)
-    ]
-    weight, nearest = _lowest(np.array(risks))
-    soft = (blur(seen.to(scene), 4.0) * seen).cpu().numpy()
-    first, second = (path[nearest][0].cpu().numpy() for path in paths)
-    resolution = window.spacing * ring_correlation(first, second, soft).resolution
-    return Smoothness(weight, resolution if math.isfinite(resolution) else None)
-
-
-def _path(normal: Normal) -> list[Tensor]:
-    """Return the scenes of all candidates, each started from the smoother one before."""
-    scene = normal.mean()
-    scenes = []
-    for smoothness in _CANDIDATES:
-        scene = normal.solve(smoothness, scene, 40)
-        scenes.append(scene)
-    return scenes
-
-
-def _lowest(risks: NDArray[np.float64]) -> tuple[float, int]:
-    """Return the smoothness of least risk, by a parabola through the lowest candidate and its neighbours."""
-    index = int(np.argmin(risks))
-    exponents = np.log10(_CANDIDATES)
-    if not 0 < index < len(risks) - 1:
-        return _CANDIDATES[index], index
-    near = slice(index - 1, index + 2)
-    curve = np.polyfit(exponents[near], np.log(risks[near] + 1e-300), 2)
-    lowest = -curve[1] / (2 * curve[0]) if curve[0] > 0 else exponents[index]
-    return float(10 ** np.clip(lowest, exponents[index + 1], exponents[index - 1])), index
-
-
-def _window(grid: Grid, scene: Tensor) -> Grid:
-    """Return the part of a grid, of limited size, in which the scene changes most."""
-    rows, columns = (min(_WINDOW, side) for side in grid.shape)
-    change = torch.zeros_like(scene)
-    change[:-1, :-1] = (scene[1:, :-1] - scene[:-1, :-1]).abs() + (scene[:-1, 1:] - scene[:-1, :-1]).abs()
-    total = torch.nn.functional.pad(change.cumsum(0).cumsum(1), (1, 0, 1, 0))
-    sums = total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
-    row, column = divmod(int(sums.argmax()), sums.shape[1])
-    return Grid(grid.x0 + column * grid.spacing, grid.y0 + row * grid.spacing, grid.spacing, (rows, columns))
