@@ -1,6 +1,7 @@
 """How the dock is laid out: sections that fold away, rows."""
 
-from qtpy.QtGui import QIcon
+from qtpy.QtCore import Qt
+from qtpy.QtGui import QIcon, QPixmap
 from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QVBoxLayout, QWidget
 from superqt import QCollapsible
 
@@ -11,7 +12,7 @@ def section(title: str, content: QWidget) -> QCollapsible:
     """Return a section around a widget, folded: it takes one line."""
     # superqt draws its own arrows once, in the colours that were there before the viewer's theme.
     folded, unfolded = f"▸  {title}", f"▾  {title}"
-    made = QCollapsible(folded, expandedIcon=QIcon(), collapsedIcon=QIcon())
+    made = QCollapsible(folded, expandedIcon=_no_icon(), collapsedIcon=_no_icon())
     made.layout().setContentsMargins(0, 0, 0, 0)
     made.layout().setSpacing(0)
     holder = QWidget()
@@ -22,6 +23,13 @@ def section(title: str, content: QWidget) -> QCollapsible:
     made.collapse(animate=False)
     made.toggled.connect(lambda is_open: made.setText(unfolded if is_open else folded))
     return made
+
+
+def _no_icon() -> QIcon:
+    """Return an icon that shows nothing. An empty one will not do: under PySide6 it counts as none."""
+    clear = QPixmap(1, 1)
+    clear.fill(Qt.GlobalColor.transparent)
+    return QIcon(clear)
 
 
 def form_layout() -> QFormLayout:
