@@ -59,7 +59,7 @@ screenshots: .venv/dev
 
 # The site, in site/; what is wrong in it is an error.
 docs: .venv/docs
-	$(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # What the site shows of the examples, and of the latest `make bench`.
 docs-pictures: .venv/bench

@@ -4,11 +4,12 @@ Each burst is fitted in a process of its own, so that its peak memory can be rea
 """
 
 import json
-import resource
 import subprocess
 import sys
 import time
 from itertools import product
+
+import psutil
 
 from benchmarks.results import COST, Results, Row
 from napari_fiberburst import Progress, reconstruct
@@ -73,8 +74,17 @@ def _fit(frames: int, side: int, channels: int, physics: str, device: str) -> Ro
 
     reconstruct(simulated.burst, device=device, preview_every=1e-9, on_progress=watch)
     seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-    return {"first_preview": previews[0], "seconds": seconds, "peak_mib": peak}
+    return {"first_preview": previews[0], "seconds": seconds, "peak_mib": _peak_memory()}
+
+
+def _peak_memory() -> float:
+    """Return the most memory that this process has had, MiB."""
+    if sys.platform == "win32":
+        peak: int = psutil.Process().memory_info().peak_wset
+        return peak / 2**20
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def _published(side: int, device: str) -> Row:

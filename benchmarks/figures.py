@@ -57,7 +57,7 @@ def _scenes(results: Results) -> Figure | None:
     figure, axes = plt.subplots(
         len(cases), len(columns), figsize=(1.9 * len(columns), 2.2 * len(cases)), squeeze=False, layout="constrained"
     )
-    for across, case in zip(axes, cases, strict=True):
+    for number, (across, case) in enumerate(zip(axes, cases, strict=True)):
         for axis, method in zip(across, columns, strict=True):
             picture = results.picture(SCENES, case, method)
             axis.set_xticks([])
@@ -66,7 +66,7 @@ def _scenes(results: Results) -> Figure | None:
                 axis.imshow(picture, cmap="gray", vmin=0, vmax=255)
             row = rows.get((case, method), {})
             axis.set_xlabel(f"{row['psnr']:.1f} dB" if "psnr" in row else row.get("missing", "")[:14], fontsize=8)
-            if across is axes[0]:
+            if number == 0:
                 axis.set_title(
                     METHODS[method].label.replace(", ", "\n") if method in METHODS else "truth", fontsize=7.5
                 )

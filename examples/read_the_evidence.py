@@ -33,10 +33,11 @@ print(
 print(f"typical uncertainty {np.nanmedian(result.uncertainty):.2g}, left-out samples: off by {result.sample_error:.2g}")
 
 truth = simulated.truth[0, ..., 0]
-off = np.abs(match_levels(np.where(empty, truth.mean(), result.image), truth) - truth)
-off[empty] = 0
+off = np.full(truth.shape, np.nan)
+off[~empty] = np.abs(match_levels(result.image[~empty][None], truth[~empty][None]) - truth[~empty])[0]
+uncertainty = np.where(empty, np.nan, result.uncertainty)
 panels: list[NDArray[np.floating]] = []
-for part in (result.image, filled.image, np.sqrt(result.coverage), result.uncertainty, off):
+for part in (result.image, filled.image, np.sqrt(result.coverage), uncertainty, off):
     low, high = np.nanpercentile(part, [0.5, 99.5])
     panels.append(np.clip(np.nan_to_num((part - low) / max(high - low, 1e-9)), 0, 1))
     panels.append(np.ones((side, 6)))
