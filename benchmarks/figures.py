@@ -96,7 +96,8 @@ def _convergence(results: Results) -> Figure | None:
             axis.plot(*curve.T, style, color=f"C{names.index(name)}", label=label, linewidth=1.4)
         axis.set(xlabel="seconds", xscale="log", title="motion" if is_motion else "encoding")
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6)
+        if shown:
+            axis.legend(fontsize=6)
     axes[0].set_ylabel("PSNR, dB")
     return figure
 
