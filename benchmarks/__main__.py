@@ -14,7 +14,7 @@ from benchmarks.ablations import ablate
 from benchmarks.compare import SLOW, compare
 from benchmarks.costs import measure_costs
 from benchmarks.methods import Effort
-from benchmarks.real import measure_real
+from benchmarks.real import RealBurst, measure_real
 from benchmarks.results import TABLES, Results
 from napari_fiberburst.errors import FiberBurstError
 
@@ -24,14 +24,14 @@ RESULTS = Path(__file__).with_name("results")
 
 def main() -> int:
     """Parse the arguments, measure, write tables and figures."""
-    logging.disable(logging.WARNING)  # what a fit says of its burst stands in its row
     options = parse()
     mode = "quick" if options.quick else "large" if options.large else "full"
     try:
         chosen = methods.find(options.methods)
         scenes = cases.find(options.scenes, cases.comparison(is_quick=options.quick, is_large=options.large))
+        real = None if options.burst is None else RealBurst.read(options.burst, options.device)
         results = Results(options.results, mode, resume=options.resume, overwrite=options.overwrite)
-        run(results, options, chosen, scenes)
+        run(results, options, chosen, scenes, real)
     except FiberBurstError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -40,7 +40,13 @@ def main() -> int:
     return 0
 
 
-def run(results: Results, options: argparse.Namespace, chosen: tuple[str, ...], scenes: tuple[cases.Case, ...]) -> None:
+def run(
+    results: Results,
+    options: argparse.Namespace,
+    chosen: tuple[str, ...],
+    scenes: tuple[cases.Case, ...],
+    real: RealBurst | None,
+) -> None:
     """Measure the tables that were asked for, and what of them is not there yet."""
     iterations = options.paper_iterations or (30 if options.quick else 3000)
     effort = Effort(paper_iterations=iterations, inpainting_steps=30 if options.quick else 600, device=options.device)
@@ -56,10 +62,11 @@ def run(results: Results, options: argparse.Namespace, chosen: tuple[str, ...], 
             fast = [name for name in chosen if name not in SLOW]
             bursts = cases.conditions(is_quick=options.quick)
             compare(results, NUMBERED[3], bursts, fast, effort, pictures=False)
-        elif number == 4 and options.burst is None:
+        elif number == 4 and real is None:
             print("  skipped: --burst FOLDER names the real burst")
         elif number == 4:
-            measure_real(results, options.burst, chosen, options.device)
+            assert real is not None
+            measure_real(results, real, chosen)
         else:
             measure_costs(results, device=options.device, is_quick=options.quick)
 
@@ -85,4 +92,5 @@ def parse() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.WARNING)  # what a fit says of its burst stands in its row
     sys.exit(main())

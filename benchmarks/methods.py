@@ -273,7 +273,8 @@ def fibrebundle(method: str, **told: Any) -> tuple[Picture, float]:
         np.savez(given, **told)
         ended = subprocess.run([PEER_PYTHON, _WORKER, method, given, made], capture_output=True, text=True)
         if ended.returncode:
-            raise PeerError(f"failed: {ended.stderr.strip().splitlines()[-1]}")
+            said = ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"]
+            raise PeerError(f"failed: {said[-1]}")
         with np.load(made) as found:
             return found["picture"], float(found["seconds"])
 

@@ -1,9 +1,10 @@
 """Copy the tables and figures of a results folder to where the documentation shows them, rows and all.
 
-The figures are made smaller: they are to be looked at, and stay in the repository's history.
+The figures become WebP: they are to be looked at, and stay in the repository's history.
 """
 
 import argparse
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from PIL import Image
 
 from benchmarks.__main__ import RESULTS
 
-COLOURS = 128
+QUALITY = 88
 
 
 def main() -> None:
@@ -23,11 +24,12 @@ def main() -> None:
     shutil.rmtree(options.target, ignore_errors=True)
     (options.target / "figures").mkdir(parents=True)
     for path in sorted(options.results.glob("figures/*.png")):
-        picture = Image.open(path).convert("RGB")
-        picture.quantize(COLOURS).save(options.target / "figures" / path.name, optimize=True)
-    # The page that shows the tables is one folder up.
+        target = options.target / "figures" / path.with_suffix(".webp").name
+        Image.open(path).convert("RGB").save(target, quality=QUALITY)
+    # The tables stand beside the page that shows them, so that their links hold for both.
     tables = (options.results / "tables.md").read_text(encoding="utf-8")
-    (options.target / "tables.md").write_text(tables.replace("(figures/", "(results/figures/"), encoding="utf-8")
+    tables = re.sub(r"\(figures/(\w+)\.png\)", r"(results/figures/\1.webp)", tables)
+    (options.target.parent / "tables.md").write_text(tables, encoding="utf-8")
     shutil.copytree(options.results / "rows", options.target / "rows")
     shutil.copy(options.results / "about.json", options.target)
 

@@ -93,9 +93,8 @@ METHODS: Mapping[str, Callable[[RealBurst, NDArray[np.uint8]], Shown]] = {
 }
 
 
-def measure_real(results: Results, folder: Path, methods: tuple[str, ...], device: str) -> None:
+def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) -> None:
     """Fill the table."""
-    real = RealBurst.read(folder, device)
     honeycomb = captured(real, real.frames).ring()
     for name in methods:
         if name not in METHODS:

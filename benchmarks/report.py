@@ -8,7 +8,7 @@ from benchmarks import figures
 from benchmarks.methods import METHODS
 from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, TABLES, Results, Row
 
-ABSENT = "-"
+ABSENT = "-"  # not measured
 DECIBELS = (20, 22, 25, 30, 35, 40)
 
 
@@ -148,7 +148,7 @@ def _real(results: Results) -> list[str]:
             method.label, f"{row['modulation']:.2f}", row["finest"], f"{row['ring_db']:.1f} dB", f"{row['nrmse']:.3f}",
             _time(row["seconds"]),
         ])  # fmt: skip
-    measured = {name: row for name, row in found.items() if "elements" in row}
+    measured = {name: found[name] for name in METHODS if "elements" in found.get(name, {})}
     each = [
         [f"G{group}E{element}", f"{period:.1f} px", *(_modulations(row, group, element) for row in measured.values())]
         for group, element, period in sorted({
@@ -220,9 +220,13 @@ def _reached(rows: Sequence[Row], decibels: float, count: int) -> str:
 
 
 def seconds_to(row: Row, decibels: float) -> float | None:
-    """Return when a method first showed a picture of this PSNR; None where it never did."""
-    shown = [*((seconds, psnr) for seconds, psnr in row["curve"]), (row["seconds"], row["psnr"])]
-    return min((seconds for seconds, psnr in shown if psnr >= decibels), default=None)
+    """Return from when on a method showed pictures of at least this PSNR; None where its last one is not."""
+    found = None
+    for seconds, psnr in reversed([*row["curve"], (row["seconds"], row["psnr"])]):
+        if psnr < decibels:
+            break
+        found = seconds
+    return found
 
 
 def _in_order(rows: Sequence[Row], column: str) -> list[str]:

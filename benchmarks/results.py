@@ -58,7 +58,7 @@ class Results:
         if about.exists():
             before = json.loads(about.read_text(encoding="utf-8"))["mode"]
             if overwrite:
-                for path in [*folder.glob("rows/*/*.json"), *folder.glob("pictures/*/*.png")]:
+                for path in [path for made in ("rows/*/*", "pictures/*/*", "figures/*") for path in folder.glob(made)]:
                     path.unlink()
             elif not resume:
                 raise OutputError(f"{folder} holds results; --resume goes on with them, --overwrite begins anew")
@@ -77,7 +77,8 @@ class Results:
         path = self.folder / "rows" / slug(table) / f"{slug(case)}.{slug(method)}.json"
         if path.exists():
             known: Row = json.loads(path.read_text(encoding="utf-8"))
-            return known
+            if "missing" not in known:  # a peer may have been installed since
+                return known
         found = {"table": table, "case": case, "method": method, **compute()}
         picture = found.pop("picture", None)
         if picture is not None:

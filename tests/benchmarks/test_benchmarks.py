@@ -1,6 +1,7 @@
 """The benchmark: its folder of rows, its methods, its reading of the chart; and what it says to bad calls."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from benchmarks.methods import METHODS, Effort, PeerError
 from benchmarks.results import CONDITIONS, SCENES, Results
 
 from benchmarks import __main__ as command
-from benchmarks import cases, chart, methods, report
+from benchmarks import cases, chart, methods, publish, report
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.quality import psnr
 from napari_fiberburst.reconstruction import Canvas
@@ -145,6 +146,9 @@ def test_time_to_quality_takes_previews_into_account():
     assert report.seconds_to(row, 20) == 2.0
     assert report.seconds_to(row, 29) == 9.0
     assert report.seconds_to(row, 31) is None
+    falling = {"curve": [(1.0, 18.0), (2.0, 36.0), (3.0, 29.0)], "seconds": 9.0, "psnr": 34.0}
+    assert report.seconds_to(falling, 35) is None
+    assert report.seconds_to(falling, 30) == 9.0
 
 
 @pytest.fixture(scope="module")
@@ -200,3 +204,21 @@ def test_the_report_is_valid_where_little_is_there(tmp_path):
     results = Results(tmp_path, "quick")
     assert "Measured" in report.write(results).read_text(encoding="utf-8")
     assert json.loads((tmp_path / "about.json").read_text())["mode"] == "quick"
+
+
+def test_what_is_published_finds_its_figures(tmp_path, monkeypatch):
+    results = Results(tmp_path / "results", "quick")
+    compare(results, SCENES, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=True)
+    report.write(results)
+    target = tmp_path / "docs" / "results"
+    monkeypatch.setattr(sys, "argv", ["publish", str(target), "--results", str(results.folder)])
+    publish.main()
+    links = re.findall(r"\]\((.+?)\)", (target.parent / "tables.md").read_text(encoding="utf-8"))
+    assert links
+    assert all((target.parent / link).exists() for link in links)
+
+
+def test_a_row_whose_peer_was_missing_is_measured_again(tmp_path):
+    Results(tmp_path, "quick").row(SCENES, "a", "unet", lambda: {"missing": "not installed"})
+    row = Results(tmp_path, "quick", resume=True).row(SCENES, "a", "unet", lambda: {"psnr": 20.0})
+    assert row["psnr"] == 20
