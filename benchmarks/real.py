@@ -28,6 +28,7 @@ LEFT_OUT = (3, 6, 10)
 PITCH = 5.28
 CORNER, SIZE, SCALE = (179, 18), 925, 2
 CHART = (400, 230, 850, 720)
+FIELD = (0, 0, *chart.FRAME[::-1])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,12 +60,12 @@ class RealBurst:
 
 def captured(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
     """Return frame 0."""
-    return Shown(frames[0].astype(float), Canvas.over((0, 0, *chart.FRAME[::-1])))
+    return Shown(frames[0].astype(float), Canvas.over(FIELD))
 
 
 def gaussian(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
     """Return frame 0, filtered."""
-    return Shown(gaussian_filter(frames[0].astype(float), FIXED_WIDTH), Canvas.over((0, 0, *chart.FRAME[::-1])))
+    return Shown(gaussian_filter(frames[0].astype(float), FIXED_WIDTH), Canvas.over(FIELD))
 
 
 def fibrebundle_single(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
@@ -80,7 +81,7 @@ def fibrebundle_super(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
 def default(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
     """Return what `reconstruct` makes of the frames."""
     result = reconstruct(Burst(frames), device=real.device)
-    canvas = Canvas.over((0, 0, *chart.FRAME[::-1]), SCALE)
+    canvas = Canvas.over(FIELD, SCALE)
     return Shown(result.render(scale=SCALE), canvas)
 
 

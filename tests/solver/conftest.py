@@ -1,5 +1,8 @@
 """A burst of single cores and its reconstruction, which the tests of the self-calibrating fit share."""
 
+from collections.abc import Callable
+
+import numpy as np
 import pytest
 
 from napari_fiberburst import Reconstruction, reconstruct
@@ -16,3 +19,15 @@ def cores() -> SimulatedBurst:
 def fitted(cores: SimulatedBurst) -> Reconstruction:
     """Return what `reconstruct` makes of `cores`, gaps filled and every preview drawn."""
     return reconstruct(cores.burst, preview_every=1e-9, fill=True)
+
+
+@pytest.fixture(scope="session")
+def same() -> Callable[[Reconstruction, Reconstruction], None]:
+    """Return a function that asserts that two runs came to the same bits."""
+
+    def assert_same(first: Reconstruction, second: Reconstruction) -> None:
+        np.testing.assert_array_equal(first.image, second.image)
+        np.testing.assert_array_equal(first.homographies, second.homographies)
+        np.testing.assert_array_equal(first.losses, second.losses)
+
+    return assert_same
