@@ -206,6 +206,15 @@ def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     assert dock.runs._list.item(0).text() == "sharp"
 
 
+def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_layer):
+    viewer, dock = open_dock(burst_layer)
+    dock.form.set_choices(QUICK)
+    for _ in range(2):
+        run_through(dock)
+    assert [viewer.layers[f"run {number}: frame outlines"].visible for number in (1, 2)] == [False, True]
+    assert [viewer.layers[f"run {number}: frame centres"].visible for number in (1, 2)] == [False, True]
+
+
 def test_comparing_shows_one_picture_alone(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)

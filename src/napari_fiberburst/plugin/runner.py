@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # The window is brought up to date ten times a second, or less often where that would take more than this part of the
 # time: where the canvas is drawn in software, as on remote desktops, the fit needs those processors.
 _MILLISECONDS = 100
-_PICTURES_SHARE, _WORDS_SHARE = 0.25, 0.08
+_PICTURES_SHARE, _WORDS_SHARE = 0.1, 0.04
 
 State = Literal["ready", "running", "paused", "stopping"]
 
