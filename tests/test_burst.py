@@ -85,6 +85,11 @@ def test_a_list_of_frames_is_a_burst(rng):
     np.testing.assert_array_equal(Burst(list(frames)).frames, Burst(frames).frames)
 
 
+def test_micro_has_one_spelling(rng):
+    greek, micro = "\N{GREEK SMALL LETTER MU}m", "\N{MICRO SIGN}m"
+    assert Burst(stack(rng, (3, 17, 23)), pixel_size=0.63, unit=greek).unit == micro
+
+
 def test_what_is_known_of_the_recording_is_kept(rng):
     burst = Burst(
         stack(rng, (3, 17, 23, 2)), channel_names=["red", "blue"], pixel_size=0.63, unit="µm", times=[0, 0.1, 0.3]

@@ -147,7 +147,8 @@ class Burst(Acquisition):
             white_level=white,
             channel_names=_names(channel_names, values.shape[3]),
             pixel_size=_pixel_size(pixel_size),
-            unit=unit,
+            # Unicode has two; OME-TIFF knows the micro sign alone, and some libraries write the Greek letter.
+            unit=None if unit is None else unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}"),
             times=_times(times, values.shape[0]),
         )
         _set(self, "frames", values)

@@ -1,5 +1,8 @@
 """The parts of the plugin that need no window."""
 
+import importlib
+import sys
+
 import dask.array as da
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.evidence import Cores
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
 from napari_fiberburst.plugin.calls import as_command, as_python
+from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.plugin.history import History, Moment
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
@@ -228,3 +232,20 @@ def test_a_layer_is_called_as_it_must_be_read(rng):
     assert source_of([rgba], "TYXC").words == ("viewer.layers['a'].data[..., :3]",)
     pyramid = Image([rng.random((5, 32, 32)), rng.random((5, 16, 16))], name="b", multiscale=True)
     assert source_of([pyramid], "TYX").words == ("viewer.layers['b'].data[0]",)
+
+
+@pytest.mark.parametrize(("library", "is_there"), [("libLLVM-15.so.1", False), ("libGLX_nvidia.so.0", True)])
+def test_triton_stays_out_where_a_driver_has_its_own_llvm(tmp_path, monkeypatch, library, is_there):
+    (tmp_path / "triton.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    maps = tmp_path / "maps"
+    maps.write_text(f"7f45c5800000-7f45c7000000 r-xp 00000000 08:01 1234 /usr/lib/{library}\n")
+    with without_clash(maps):
+        if is_there:
+            importlib.import_module("triton")
+        else:
+            with pytest.raises(ModuleNotFoundError, match="triton"):
+                importlib.import_module("triton")
+    assert importlib.import_module("triton").__file__ == str(tmp_path / "triton.py")
+    monkeypatch.delitem(sys.modules, "triton")

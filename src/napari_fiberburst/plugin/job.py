@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.control import Control
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.plugin.bursts import BurstSource, Truth
+from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.streaming import Latest
 
 if TYPE_CHECKING:
@@ -126,15 +127,16 @@ class Job:
         try:
             burst = self._source.read()
             self.acquisition = burst.acquisition
-            result = reconstruct(
-                burst,
-                **self._choices,
-                calibration=self._calibration,
-                initial=self._initial,
-                control=self.control,
-                should_stop=should_stop,
-                on_progress=self._take,
-            )
+            with without_clash():
+                result = reconstruct(
+                    burst,
+                    **self._choices,
+                    calibration=self._calibration,
+                    initial=self._initial,
+                    control=self.control,
+                    should_stop=should_stop,
+                    on_progress=self._take,
+                )
             if not np.isfinite(result.image).any():
                 raise FiberBurstError(
                     f"the fit came to no numbers ({result.ending}); try the preset auto, or a lower learning rate"
