@@ -31,11 +31,13 @@ def main() -> int:
         scenes = cases.find(options.scenes, cases.comparison(is_quick=options.quick, is_large=options.large))
         real = None if options.burst is None else RealBurst.read(options.burst, options.device)
         results = Results(options.results, mode, resume=options.resume, overwrite=options.overwrite)
-        run(results, options, chosen, scenes, real)
+        try:
+            run(results, options, chosen, scenes, real)
+        finally:  # what there is stands in the tables, however the run ends
+            report.write(results)
     except FiberBurstError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    report.write(results)
     print(f"wrote {options.results}: tables.md, figures, and rows, a file each")
     return 0
 

@@ -32,18 +32,19 @@ def ablate(results: Results, case: Case, *, iterations: int, device: str, is_qui
 def _row(
     results: Results, case: Case, preset: str, motion: str, encoding: str, *, iterations: int | None, device: str
 ) -> None:
+    choices: dict[str, Any] = {"preset": preset, "motion": motion, "encoding": encoding, "device": device}
+    if iterations is not None:
+        choices |= {"iterations": iterations, "learning_rate": LEARNING_RATE}
+    if preset == "auto":
+        choices |= {"fill": True}
+    elif encoding == "fourier":
+        choices |= {"sigma": case.sigma}
+
     def compute() -> Row:
-        choices: dict[str, Any] = {"preset": preset, "motion": motion, "encoding": encoding, "device": device}
-        if iterations is not None:
-            choices |= {"iterations": iterations, "learning_rate": LEARNING_RATE}
-        if preset == "auto":
-            choices |= {"fill": True}
-        elif encoding == "fourier":
-            choices |= {"sigma": case.sigma}
         simulated = case.make()
         outcome = reconstructed(simulated, **choices)
-        told = {"motion": motion, "encoding": encoding, "bundle_model": preset == "auto"}
-        return {"burst": asdict(case), **told, **score(outcome, simulated), "picture": outcome.picture}
+        return {**score(outcome, simulated), "picture": outcome.picture}
 
     name = f"{motion} {encoding} {'with' if preset == 'auto' else 'without'} bundle model"
-    print(f"  {name:45} {in_words(results.row(ABLATION, case.name, name, compute))}", flush=True)
+    given = {"burst": asdict(case), "bundle_model": preset == "auto", **choices}
+    print(f"  {name:45} {in_words(results.row(ABLATION, case.name, name, compute, given))}", flush=True)

@@ -32,19 +32,19 @@ def compare(
         if pictures:
             results.row(table, case.name, "truth", lambda case=case: {"picture": case.make().truth[0]})  # type: ignore[misc]
         for name in methods:
-            row = results.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures))  # noqa: B023
+            given = {"burst": asdict(case), **{part: getattr(effort, part) for part in METHODS[name].heeds}}
+            row = results.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures), given)  # noqa: B023
             print(f"  {METHODS[name].label:34} {in_words(row)}", flush=True)
 
 
 def measure(case: Case, name: str, effort: Effort, *, pictures: bool) -> Row:
     """Return one row."""
     simulated = case.make()
-    told = {"burst": asdict(case)}
     try:
         outcome = METHODS[name].run(case, simulated, effort)
     except PeerError as error:
-        return {**told, "missing": str(error)}
-    row = {**told, **score(outcome, simulated)}
+        return {"missing": str(error)}
+    row = score(outcome, simulated)
     if pictures:
         row["picture"] = match_levels(outcome.picture, simulated.truth[0])
     return row

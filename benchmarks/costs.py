@@ -15,6 +15,7 @@ import psutil
 
 from benchmarks.results import COST, Results, Row
 from napari_fiberburst import Progress, reconstruct
+from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import simulate
 from napari_fiberburst.solver import iterate
@@ -46,19 +47,25 @@ def measure_costs(results: Results, *, device: str, is_quick: bool) -> None:
         size = f"{frames} x {side} x {side} x {channels}, {physics}"
 
         def compute(told: tuple[str, ...] = (str(frames), str(side), str(channels), physics, device)) -> Row:
-            ended = subprocess.run(
-                [sys.executable, "-m", "benchmarks.costs", *told], capture_output=True, text=True, check=True
-            )
+            ended = subprocess.run([sys.executable, "-m", "benchmarks.costs", *told], capture_output=True, text=True)
+            if ended.returncode:
+                raise FiberBurstError(
+                    f"the fit of {' x '.join(told[:3])} ended with {ended.returncode}: {ended.stderr}"
+                )
             found: Row = json.loads(ended.stdout)
             return found
 
-        row = results.row(COST, size, "default", compute)
+        row = results.row(COST, size, "default", compute, {"device": device})
         times = f"first preview {row['first_preview']:5.1f} s, finished {row['seconds']:5.1f} s"
         print(f"  {size:30} {times}, peak {row['peak_mib']:5.0f} MiB", flush=True)
     side = 96 if is_quick else 600
-    row = results.row(COST, f"20 x {side} x {side} x 3, core", "paper", lambda: _published(side, device))
+    row = results.row(
+        COST, f"20 x {side} x {side} x 3, core", "paper", lambda: _published(side, device), {"device": device}
+    )
     print(f"  published method: {row['seconds_a_step']:.2f} s a step, {row['seconds'] / 60:.0f} min for its 3000")
-    row = results.row(COST, f"20 x {side} x {side} x 3, core", "stages", lambda: _stages(side, device))
+    row = results.row(
+        COST, f"20 x {side} x {side} x 3, core", "stages", lambda: _stages(side, device), {"device": device}
+    )
     print("  " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row["stages"].items()))
 
 

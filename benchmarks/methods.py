@@ -93,11 +93,14 @@ class Method:
         What it is given beside the burst.
     run : callable
         (case, simulated burst, effort) to outcome.
+    heeds : tuple of str
+        The parts of the effort that make a difference to it.
     """
 
     label: str
     told: str
     run: Callable[[Case, SimulatedBurst, Effort], Outcome]
+    heeds: tuple[str, ...] = ()
 
 
 def captured(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
@@ -186,7 +189,7 @@ METHODS: Mapping[str, Method] = {
     "captured": Method(label="captured frame", told="", run=captured),
     "gaussian": Method(label="Gaussian filter, best width", told="the truth, to choose its width", run=gaussian),
     "gaussian-fixed": Method(label="Gaussian filter, 2 px", told="", run=gaussian_fixed),
-    "mean": Method(label="mean after registration", told="our registration", run=registered_mean),
+    "mean": Method(label="mean after registration", told="our registration", run=registered_mean, heeds=("device",)),
     "pyfibrebundle": Method(
         label="PyFibreBundle, one frame", told="true layout and transmission", run=fibrebundle_single
     ),
@@ -194,10 +197,14 @@ METHODS: Mapping[str, Method] = {
         label="PyFibreBundle, super-resolution", told="true layout and transmission", run=fibrebundle_super
     ),
     "unet": Method(label="supervised U-Net", told="1200 training pairs", run=supervised),
-    "inpainting": Method(label="INR inpainting", told="true layout and transmission", run=inpainted),
-    "paper": Method(label="published method", told="sigma by the true pitch", run=paper),
-    "default": Method(label="napari-fiberburst", told="", run=default),
-    "oracle": Method(label="oracle", told="true motion and transmission", run=oracle),
+    "inpainting": Method(
+        label="INR inpainting", told="true layout and transmission", run=inpainted, heeds=("inpainting_steps",)
+    ),
+    "paper": Method(
+        label="published method", told="sigma by the true pitch", run=paper, heeds=("paper_iterations", "device")
+    ),
+    "default": Method(label="napari-fiberburst", told="", run=default, heeds=("device",)),
+    "oracle": Method(label="oracle", told="true motion and transmission", run=oracle, heeds=("device",)),
 }
 
 

@@ -58,34 +58,37 @@ class RealBurst:
         return cls(frames=tifffile.imread(folder / "burst.tif"), background=background, device=device)
 
 
-def captured(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
-    """Return frame 0."""
-    return Shown(frames[0].astype(float), Canvas.over(FIELD))
+def captured(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
+    """Return frame 0; and the seconds it took, as all methods do."""
+    return Shown(frames[0].astype(float), Canvas.over(FIELD)), 0.0
 
 
-def gaussian(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
+def gaussian(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return frame 0, filtered."""
-    return Shown(gaussian_filter(frames[0].astype(float), FIXED_WIDTH), Canvas.over(FIELD))
+    start = time.perf_counter()
+    picture = gaussian_filter(frames[0].astype(float), FIXED_WIDTH)
+    return Shown(picture, Canvas.over(FIELD)), time.perf_counter() - start
 
 
-def fibrebundle_single(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
+def fibrebundle_single(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return what PyFibreBundle makes of frame 0."""
     return _fibrebundle("single", real, frames)
 
 
-def fibrebundle_super(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
+def fibrebundle_super(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return what PyFibreBundle makes of all frames."""
     return _fibrebundle("super", real, frames)
 
 
-def default(real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
+def default(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return what `reconstruct` makes of the frames."""
-    result = reconstruct(Burst(frames), device=real.device)
-    canvas = Canvas.over(FIELD, SCALE)
-    return Shown(result.render(scale=SCALE), canvas)
+    start = time.perf_counter()
+    picture = reconstruct(Burst(frames), device=real.device).render(scale=SCALE)
+    return Shown(picture, Canvas.over(FIELD, SCALE)), time.perf_counter() - start
 
 
-METHODS: Mapping[str, Callable[[RealBurst, NDArray[np.uint8]], Shown]] = {
+Method = Callable[[RealBurst, NDArray[np.uint8]], tuple[Shown, float]]
+METHODS: Mapping[str, Method] = {
     "captured": captured,
     "gaussian-fixed": gaussian,
     "pyfibrebundle": fibrebundle_single,
@@ -96,7 +99,7 @@ METHODS: Mapping[str, Callable[[RealBurst, NDArray[np.uint8]], Shown]] = {
 
 def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) -> None:
     """Fill the table."""
-    honeycomb = captured(real, real.frames).ring()
+    honeycomb = captured(real, real.frames)[0].ring()
     for name in methods:
         if name not in METHODS:
             continue
@@ -107,7 +110,7 @@ def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) ->
             except PeerError as error:
                 return {"missing": str(error)}
 
-        row = results.row(REAL, "chart", name, compute)
+        row = results.row(REAL, "chart", name, compute, {"device": real.device} if name == "default" else {})
         line = row.get(
             "missing"
         ) or "M {modulation:.2f}, finest {finest}, ring {ring_db:.1f} dB, nrmse {nrmse:.3f}, {seconds:.1f} s".format(
@@ -116,12 +119,10 @@ def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) ->
         print(f"  {name:20} {line}", flush=True)
 
 
-def _measure(real: RealBurst, method: Callable[[RealBurst, NDArray[np.uint8]], Shown], honeycomb: float) -> Row:
-    start = time.perf_counter()
-    shown = method(real, real.frames)
-    seconds = time.perf_counter() - start
+def _measure(real: RealBurst, method: Method, honeycomb: float) -> Row:
+    shown, seconds = method(real, real.frames)
     elements = list(shown.elements())
-    errors = [_prediction_error(real, method(real, np.delete(real.frames, left, axis=0)), left) for left in LEFT_OUT]
+    errors = [_prediction_error(real, method(real, np.delete(real.frames, left, axis=0))[0], left) for left in LEFT_OUT]
     profiles = {
         f"G{group}E{element}": [part.tolist() for part in shown.profile(group, element, "V")]
         for group, element in ((7, 1), (7, 4), (7, 6))
@@ -141,8 +142,8 @@ def _measure(real: RealBurst, method: Callable[[RealBurst, NDArray[np.uint8]], S
     }
 
 
-def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> Shown:
-    picture, _ = fibrebundle(
+def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
+    picture, seconds = fibrebundle(
         method,
         frames=np.maximum(frames.astype(np.float64) - BLACK_LEVEL, 0)[..., None] / 255,
         bundle=np.maximum(real.background.astype(np.float64) - BLACK_LEVEL, 0) / 255,
@@ -155,7 +156,7 @@ def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> Sho
     # Its pixels reach from the centre of the first pixel of the square to that of the last.
     step = (SIZE - 1) / (SCALE * SIZE - 1)
     matrix = np.array([[step, 0, CORNER[0]], [0, step, CORNER[1]], [0, 0, 1]])
-    return Shown(picture[..., 0], Canvas(shape=picture.shape[:2], frame0_from_image=matrix))
+    return Shown(picture[..., 0], Canvas(shape=picture.shape[:2], frame0_from_image=matrix)), seconds
 
 
 def _prediction_error(real: RealBurst, shown: Shown, left: int) -> float:

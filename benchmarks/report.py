@@ -6,7 +6,7 @@ from statistics import mean
 
 from benchmarks import figures
 from benchmarks.methods import METHODS
-from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, TABLES, Results, Row
+from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, Results, Row
 
 ABSENT = "-"  # not measured
 DECIBELS = (20, 22, 25, 30, 35, 40)
@@ -33,21 +33,24 @@ def _about(results: Results) -> str:
     about = results.about
     versions = ", ".join(f"{name} {number}" for name, number in about["versions"].items() if number)
     machine = f"{about['processor']}, {about['cores']} cores, {about['memory_gib']} GiB, {about['gpu'] or 'no GPU'}"
-    rows = [row for name in TABLES for row in results.rows(name)]
-    commits = ", ".join(sorted({str(row["commit"]) for row in rows if row["commit"]}))
-    dates = sorted(row["date"] for row in rows)
-    span = f"{dates[0][:16]} to {dates[-1][:16]}" if dates else about["date"][:16]
     return (
-        f"Measured {span} UTC ({about['mode']} run), commit {commits or 'unknown'}, on {about['system']}, {machine}; "
-        f"Python {about['python']}, {versions}. A plus after the commit: with changes not yet committed."
+        f"Measured on {about['system']}, {machine}; Python {about['python']}, {versions} ({about['mode']} run). The "
+        "date of each table is UTC; a plus after its commit: with changes not yet committed."
     )
+
+
+def _measured(rows: Sequence[Row]) -> str:
+    dates = sorted(row["date"] for row in rows)
+    first, last = dates[0][:16], dates[-1][:16]
+    commits = ", ".join(sorted({str(row["commit"]) for row in rows if row["commit"]})) or "unknown"
+    return f"Measured {first if first == last else f'{first} to {last}'}, commit {commits}."
 
 
 def _scenes(results: Results) -> list[str]:
     rows = [row for row in results.rows(SCENES) if row["method"] != "truth"]
     if not rows:
         return []
-    parts = ["### Table 1. Five scenes"]
+    parts = ["### Table 1. Five scenes", _measured(rows)]
     for case in _in_order(rows, "case"):
         own = {row["method"]: row for row in rows if row["case"] == case}
         burst = next(iter(own.values()))["burst"]
@@ -98,7 +101,8 @@ def _ablation(results: Results) -> list[str]:
     return [
         "### Table 2. Motion and encoding",
         f"{burst['scene']}, {burst['physics']} bundle, {burst['frames']} x {burst['side']} x {burst['side']}, pitch "
-        f"{burst['pitch']:g}. PSNR dB / SSIM, motion off by (after the fit; a flow is no homography), time.",
+        f"{burst['pitch']:g}. PSNR dB / SSIM, motion off by (after the fit; a flow is no homography), time. "
+        + _measured(rows),
         table(header, lines),
         "![Convergence](figures/convergence.png)",
     ]
@@ -126,7 +130,7 @@ def _conditions(results: Results) -> list[str]:
         "### Table 3. Conditions",
         f"As it is: {burst['scene']}, {burst['physics']} bundle, {burst['frames']} x {burst['side']} x "
         f"{burst['side']}, pitch {burst['pitch']:g}, 10,000 electrons, jitter 0.09. Each line changes one thing. "
-        "PSNR dB / SSIM, and how far our motion is off, with the frames it uses.",
+        "PSNR dB / SSIM, and how far our motion is off, with the frames it uses. " + _measured(rows),
         table(["", *(METHODS[name].label for name in names), "our motion"], lines),
         "![Conditions](figures/conditions.png)",
     ]
@@ -159,7 +163,8 @@ def _real(results: Results) -> list[str]:
         "### Table 4. The real burst",
         "12 frames of 960 x 1280. M: mean modulation of the bars of group 7. Ring: the honeycomb that is left, against "
         "the raw frame. Prediction: error of the cores of frames 4, 7 and 11, each left out in turn, in standard "
-        "deviations. PyFibreBundle is given the background image; ours is given nothing.",
+        "deviations. PyFibreBundle is given the background image; ours is given nothing. "
+        + _measured(list(found.values())),
         table(["", "M, group 7", "finest element", "ring", "prediction", "time"], lines),
         "Modulation of horizontal / vertical bars, a star where resolved:",
         table(["element", "period", *(METHODS[name].label for name in measured)], each),
@@ -188,6 +193,7 @@ def _costs(results: Results) -> list[str]:
     ]
     parts = [
         "### Table 5. Time and memory",
+        _measured(rows),
         table(["frames x H x W x C", "first preview", "finished", "peak memory"], lines),
     ]
     for row in rows:

@@ -67,24 +67,36 @@ class Results:
                     f"{folder} holds results of a {before} run; this is a {mode} one: name another folder"
                 )
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(about, {"mode": mode, **describe_machine()})
+        machine = describe_machine()
+        self._commit = machine["commit"]  # files may change while a long run goes on; it does not see that
+        write_json(about, {"mode": mode, **machine})
 
-    def row(self, table: str, case: str, method: str, compute: Callable[[], Row]) -> Row:
-        """Return a row: as it was written before, or computed and written now.
+    def row(self, table: str, case: str, method: str, compute: Callable[[], Row], given: Row | None = None) -> Row:
+        """Return a row: as it was written before from the same recipe, or computed and written now.
 
-        A picture in the row, (H, W) or (H, W, C) with 1 as full scale, is written beside it as PNG.
+        Parameters
+        ----------
+        table, case, method : str
+            Where it stands.
+        compute : callable
+            Makes what was found. A picture in it, (H, W) or (H, W, C) with 1 as full scale, is written beside the row
+            as PNG.
+        given : dict, optional
+            The recipe, which becomes part of the row: the burst, and how many steps a method may take.
         """
         path = self.folder / "rows" / slug(table) / f"{slug(case)}.{slug(method)}.json"
+        recipe: Row = json.loads(_as_json(given or {}))
         if path.exists():
             known: Row = json.loads(path.read_text(encoding="utf-8"))
-            if "missing" not in known:  # a peer may have been installed since
+            is_same = all(name in known and known[name] == value for name, value in recipe.items())
+            if is_same and "missing" not in known:  # a peer may have been installed since
                 return known
-        found = {"table": table, "case": case, "method": method, **compute()}
+        found = {"table": table, "case": case, "method": method, **recipe, **compute()}
         picture = found.pop("picture", None)
         if picture is not None:
             drawn = self.folder / "pictures" / slug(table) / f"{slug(case)}.{slug(method)}.png"
             write_picture(drawn, picture)
-        write_json(path, {**found, "commit": commit(), "date": now()})
+        write_json(path, {**found, "commit": self._commit, "date": now()})
         return found
 
     def rows(self, table: str) -> Iterator[Row]:
@@ -141,7 +153,7 @@ def write_json(path: Path, told: Row) -> None:
     """Write plain values, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(told, indent=1, default=float), encoding="utf-8")
+    part.write_text(_as_json(told), encoding="utf-8")
     os.replace(part, path)
 
 
@@ -156,6 +168,10 @@ def write_picture(path: Path, picture: NDArray[np.floating]) -> None:
 def slug(name: str) -> str:
     """Return a name that can be a file's."""
     return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
+
+
+def _as_json(told: Row) -> str:
+    return json.dumps(told, indent=1, default=float)
 
 
 def _version(name: str) -> str | None:

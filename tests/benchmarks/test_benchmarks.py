@@ -222,3 +222,18 @@ def test_a_row_whose_peer_was_missing_is_measured_again(tmp_path):
     Results(tmp_path, "quick").row(SCENES, "a", "unet", lambda: {"missing": "not installed"})
     row = Results(tmp_path, "quick", resume=True).row(SCENES, "a", "unet", lambda: {"psnr": 20.0})
     assert row["psnr"] == 20
+
+
+def test_a_row_of_another_recipe_is_measured_again(tmp_path):
+    Results(tmp_path, "quick").row(SCENES, "a", "paper", lambda: {"psnr": 1.0}, {"paper_iterations": 30})
+    again = Results(tmp_path, "quick", resume=True)
+    assert again.row(SCENES, "a", "paper", lambda: {"psnr": 2.0}, {"paper_iterations": 30})["psnr"] == 1
+    assert again.row(SCENES, "a", "paper", lambda: {"psnr": 3.0}, {"paper_iterations": 3000})["psnr"] == 3
+
+
+def test_a_failed_fit_is_told_and_leaves_the_tables(tmp_path, monkeypatch, capsys):
+    arguments = ["--quick", "--tables", "5", "--device", "abacus", "--results", str(tmp_path / "new")]
+    monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
+    assert command.main() == 2
+    assert "abacus" in capsys.readouterr().err
+    assert (tmp_path / "new" / "tables.md").exists()

@@ -44,6 +44,7 @@ def open_dock(make_napari_viewer, qtbot) -> Callable[..., Any]:
         for layer in layers:
             viewer.add_layer(layer)
         dock = FiberBurstWidget(viewer)
+        qtbot.addWidget(dock)  # one that is taken out of the window is nobody's to delete
         viewer.window.add_dock_widget(dock, name="fiber burst")
         return viewer, dock
 

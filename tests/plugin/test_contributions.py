@@ -92,7 +92,6 @@ def test_the_layers_menu_registers_and_reconstructs(make_napari_viewer, qtbot, b
         pass
     assert viewer.layers["run 1: stabilised burst"].visible
     assert not viewer.layers["run 1: picture"].visible
-    viewer.window.remove_dock_widget("all")
 
 
 def test_preferences_come_from_naparis_page(plugin_settings, npe2pm):

@@ -47,7 +47,6 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
             path = folder / f"plugin_{theme}_{width}x{height}.png"
             viewer.window.screenshot(str(path), canvas_only=False, flash=False)
             assert imread(path).shape[:2] == (height, width)
-    viewer.window.remove_dock_widget("all")
 
 
 def dark(picture: np.ndarray) -> float:
