@@ -78,4 +78,4 @@ def test_a_footprint_is_a_disc_of_its_radius_and_its_own_adjoint():
     offset = torch.arange(kernel.shape[0]) - kernel.shape[0] // 2
     spread = (kernel * (offset[:, None] ** 2 + offset[None, :] ** 2)).sum()
     assert float(spread) == pytest.approx(3.0**2 / 2, rel=0.05)  # second moment of an even disc
-    assert float(footprint.transfer(torch.zeros(1))) == pytest.approx(1)
+    assert float(footprint.transfer(torch.zeros(1), torch.zeros(1))) == pytest.approx(1)

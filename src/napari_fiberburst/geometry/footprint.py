@@ -47,11 +47,12 @@ class Footprint:
         filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
         return filtered
 
-    def transfer(self, frequency: Tensor) -> Tensor:
-        """Return the filter's response at frequencies (F,) along y by the same along x, cycles per node: (F, F)."""
+    def transfer(self, along_y: Tensor, along_x: Tensor) -> Tensor:
+        """Return the filter's response at frequencies (Fy,) by (Fx,), cycles per node: (Fy, Fx)."""
         reach = self._kernel.shape[0] // 2
-        waves = torch.cos(2 * math.pi * frequency[:, None] * torch.arange(-reach, reach + 1))
-        response: Tensor = waves @ self._kernel @ waves.T
+        offsets = torch.arange(-reach, reach + 1).to(along_y)
+        by_y, by_x = (torch.cos(2 * math.pi * along[:, None] * offsets) for along in (along_y, along_x))
+        response: Tensor = by_y @ self._kernel.to(along_y) @ by_x.T
         return response
 
 

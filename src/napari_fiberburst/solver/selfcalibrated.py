@@ -53,6 +53,7 @@ class SelfCalibrated:
         self.canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]), settings.upsample)
         self._smoothness: float | None = None
         self._normal: Normal | None = None
+        self._scene: Tensor | None = None
         self._chosen: Smoothness | None = None
         self._error: float | None = None
 
@@ -133,11 +134,12 @@ class SelfCalibrated:
         """Solve once, take from it what is left to learn of the gains, and show it."""
         seen, points = self.alignment.observation, self.alignment.points()
         normal = assemble(grid, seen, points)
-        scene = normal.solve(UNTOLD if self._fixed is None else self._fixed, normal.mean(), 25)
+        smoothness = UNTOLD if self._fixed is None else self._fixed
+        scene = normal.solve(smoothness, normal.mean(), 25)
         if not self.alignment.is_still:
             known = self.alignment.calibration.is_trusted
             self.alignment.observation = refreshed(seen, points, grid, normal.through(scene), shares_known=known)
-        self._keep(normal, grid, scene)
+        self._keep(normal, scene, smoothness)
         return scene
 
     def _solve_finally(self, grid: Grid, scene: Tensor) -> Generator[str, None, None]:
@@ -158,13 +160,13 @@ class SelfCalibrated:
         normal = assemble(grid, seen, points, (~held).to(points))
         scene = normal.solve(self._smoothness, scene)
         self._error = _missed(seen, points, grid, normal.through(scene), held)
-        self._keep(normal, grid, scene)
+        self._keep(normal, scene, self._smoothness)
         yield "sample error known"
         if held.any():
             rest = assemble(grid, seen, points, held.to(points))
             normal.stencil, normal.light = normal.stencil + rest.stencil, normal.light + rest.light
             scene = normal.solve(self._smoothness, scene)
-        self._keep(normal, grid, scene)
+        self._keep(normal, scene, self._smoothness)
 
     @property
     def _fixed(self) -> float | None:
@@ -177,14 +179,15 @@ class SelfCalibrated:
         chance = torch.rand(seen.weights.shape, generator=generator).to(seen.weights.device)
         return (chance < self._settings.held_out) & (seen.weights > 0)
 
-    def _solve_quickly(self) -> tuple[Normal, Grid, Tensor]:
+    def _solve_quickly(self) -> tuple[Normal, Tensor, float]:
         """Solve a coarse first picture of all that is known so far."""
         seen = self.alignment.in_colour()
         self._place_canvas()
         spacing = max(_PREVIEW_SPACING / self._settings.upsample, _PREVIEW_PITCHES * self.alignment.pitch)
         grid = self._grid(spacing, self.canvas)
         normal = assemble(grid, seen, self.alignment.points(seen))
-        return normal, grid, normal.solve(UNTOLD if self._fixed is None else self._fixed, normal.mean(), 12)
+        smoothness = UNTOLD if self._fixed is None else self._fixed
+        return normal, normal.solve(smoothness, normal.mean(), 12), smoothness
 
     def _place_canvas(self) -> None:
         """Lay the canvas over the reference frame, or over all that any frame saw."""
@@ -204,13 +207,13 @@ class SelfCalibrated:
         margin = spacing * np.ceil((self.alignment.pitch + self.alignment.calibration.radius) / spacing)
         return Grid.over((*(first - margin).tolist(), *(last + margin).tolist()), spacing)
 
-    def _keep(self, normal: Normal, grid: Grid, scene: Tensor) -> None:
-        """Keep a scene as the picture to show."""
-        self._normal = normal
+    def _keep(self, normal: Normal, scene: Tensor, smoothness: float) -> None:
+        """Keep a solution, and the picture it stands for."""
+        self._normal, self._scene = normal, scene
         known = normal.density() > 1e-3
         self.picture = SplinePicture(
-            scene=scene,
-            grid=grid,
+            scene=normal.picture(scene, smoothness),
+            grid=normal.grid,
             known=known,
             reach=self.alignment.pitch,
             fill=self._settings.fill,
@@ -265,6 +268,7 @@ class SelfCalibrated:
         """Return the reconstruction, as far as it has come."""
         assert self.picture is not None
         assert self._normal is not None
+        assert self._scene is not None
         return Reconstruction(
             image=self._draw(self.picture),
             canvas=self.canvas,
@@ -281,7 +285,7 @@ class SelfCalibrated:
             resolution=None if self._chosen is None else self._chosen.resolution,
             **self.bundle_evidence(),
             **fit_evidence(
-                self.alignment, self._normal, self.picture.scene, self.canvas, self._smoothness or UNTOLD, self._burst
+                self.alignment, self._normal, self._scene, self.canvas, self._smoothness or UNTOLD, self._burst
             ),
         )
 

@@ -75,7 +75,13 @@ def choose_smoothness(
     seen = (both > 0.2 * both.max()) & (both > 0)
     if not bool(seen.any()):
         return Smoothness(UNTOLD, None)
-    paths = [_path(half, _CANDIDATES) for half in halves]
+    paths = [
+        [
+            half.picture(scene, smoothness)
+            for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)
+        ]
+        for half in halves
+    ]
     reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
     risks = [
         float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, seen].mean())
