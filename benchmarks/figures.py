@@ -83,16 +83,15 @@ def _convergence(results: Results) -> Figure | None:
         shown = [
             row
             for row in rows
-            if (row["encoding"] == "fourier" if is_motion else row["motion"] == "homography")
-            or row["encoding"] == "spline"
+            if (row["encoding"] in ("fourier", "spline") if is_motion else row["motion"] == "homography")
         ]
         names = list(dict.fromkeys(row["motion" if is_motion else "encoding"] for row in shown))
         for row in shown:
             name = row["motion" if is_motion else "encoding"]
-            kind = "spline, " if row["encoding"] == "spline" else ""
+            kind = "spline, " if is_motion and row["encoding"] == "spline" else ""
             label = f"{kind}{name}, {'with' if row['bundle_model'] else 'without'} bundle model"
             curve = np.array([*row["curve"], (row["seconds"], row["psnr"])])
-            style = ":" if kind else "-" if row["bundle_model"] else "--"
+            style = ":" if row["encoding"] == "spline" else "-" if row["bundle_model"] else "--"
             axis.plot(*curve.T, style, color=f"C{names.index(name)}", label=label, linewidth=1.4)
         axis.set(xlabel="seconds", xscale="log", title="motion" if is_motion else "encoding")
         axis.grid(alpha=0.3)

@@ -81,3 +81,8 @@ def test_a_picture_is_as_sharp_between_its_nodes_as_at_them():
     between = normal.grid.nodes()[INSIDE] + 0.5
     drawn = picture.render(between.numpy().astype(np.float64), 0)[..., 0]
     assert np.sqrt(np.mean((drawn - wave(between, 4.0).numpy()) ** 2)) < 0.05 * 0.3
+
+
+def test_a_picture_of_nothing_is_finite():
+    normal = Normal(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
+    assert torch.isfinite(normal.picture(normal.solve(0.1, normal.mean()), 0.1)).all()

@@ -120,8 +120,8 @@ class Normal:
             What it was solved with.
         """
         density = self.density()
-        mean = float(density[density > _LEAST_DENSITY * density.max()].mean())
-        _, right, below, below_right, below_left = self.stencil.bands.sum(dim=(1, 2)) / density.sum()
+        mean = float(density[density >= _LEAST_DENSITY * density.max()].mean())
+        _, right, below, below_right, below_left = self.stencil.bands.sum(dim=(1, 2)) / density.sum().clamp_min(1e-12)
         ties = below_right + below_left
         padded = torch.nn.functional.pad(scene[None], (_RIM,) * 4, mode="replicate")[0]
         height, width = padded.shape[-2:]
