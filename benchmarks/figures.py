@@ -78,7 +78,7 @@ def _convergence(results: Results) -> Figure | None:
     rows = [row for row in results.rows(ABLATION) if row["curve"]]
     if not rows:
         return None
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(11, 5.5), sharey=True, layout="constrained")
     for axis, is_motion in zip(axes, (True, False), strict=True):
         shown = [
             row
@@ -96,7 +96,7 @@ def _convergence(results: Results) -> Figure | None:
         axis.set(xlabel="seconds", xscale="log", title="motion" if is_motion else "encoding")
         axis.grid(alpha=0.3)
         if shown:
-            axis.legend(fontsize=6)
+            axis.legend(fontsize=7, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.12))
     axes[0].set_ylabel("PSNR, dB")
     return figure
 
