@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from napari.layers import Image
 from napari.utils import progress
+from qtpy.compat import isalive
 from qtpy.QtCore import QSettings
 
 from napari_fiberburst.plugin.dock import FiberBurstWidget
@@ -38,18 +39,22 @@ def burst_layer(simulated) -> Image:
 @pytest.fixture
 def open_dock(make_napari_viewer, qtbot) -> Callable[..., Any]:
     """Return a function that opens a viewer with the dock and these layers; returns both."""
+    docks: list[FiberBurstWidget] = []
 
     def opened(*layers: Image) -> tuple[Any, FiberBurstWidget]:
         viewer = make_napari_viewer()
         for layer in layers:
             viewer.add_layer(layer)
         dock = FiberBurstWidget(viewer)
-        qtbot.addWidget(dock)  # one that is taken out of the window is nobody's to delete
+        docks.append(dock)
         viewer.window.add_dock_widget(dock, name="fiber burst")
         return viewer, dock
 
     yield opened
     assert not progress._all_instances
+    for dock in docks:
+        if isalive(dock) and dock.parent() is None:
+            dock.deleteLater()  # one that was taken out of its window is nobody else's to delete
 
 
 @pytest.fixture

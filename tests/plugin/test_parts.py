@@ -248,4 +248,4 @@ def test_triton_stays_out_where_a_driver_has_its_own_llvm(tmp_path, monkeypatch,
             with pytest.raises(ModuleNotFoundError, match="triton"):
                 importlib.import_module("triton")
     assert importlib.import_module("triton").__file__ == str(tmp_path / "triton.py")
-    monkeypatch.delitem(sys.modules, "triton")
+    del sys.modules["triton"]  # not by monkeypatch, which would put it back in the end

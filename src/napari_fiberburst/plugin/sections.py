@@ -1,18 +1,27 @@
 """How the dock is laid out: sections that fold away, rows."""
 
-from qtpy.QtCore import Qt
+from qtpy.QtCore import QEvent, QObject, Qt
 from qtpy.QtGui import QIcon, QPixmap
 from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QVBoxLayout, QWidget
 from superqt import QCollapsible
 
-_ABOVE_CONTENT = 4
+_ABOVE_CONTENT, _BELOW_CONTENT = 4, 10
+
+
+class _Section(QCollapsible):
+    """Grows with what is in it, also where that changes while it is open."""
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        if event.type() == QEvent.Type.LayoutRequest and self.isExpanded():
+            self.content().setMaximumHeight(self.content().sizeHint().height() + _BELOW_CONTENT)
+        return bool(super().eventFilter(watched, event))
 
 
 def section(title: str, content: QWidget) -> QCollapsible:
     """Return a section around a widget, folded: it takes one line."""
     # superqt draws its own arrows once, in the colours that were there before the viewer's theme.
     folded, unfolded = f"▸  {title}", f"▾  {title}"
-    made = QCollapsible(folded, expandedIcon=_no_icon(), collapsedIcon=_no_icon())
+    made = _Section(folded, expandedIcon=_no_icon(), collapsedIcon=_no_icon())
     made.layout().setContentsMargins(0, 0, 0, 0)
     made.layout().setSpacing(0)
     holder = QWidget()
