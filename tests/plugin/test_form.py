@@ -2,9 +2,11 @@
 
 import pytest
 from qtpy.QtCore import Qt
+from qtpy.QtWidgets import QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.preferences import Preferences, remember, remembered
+from napari_fiberburst.plugin.sections import section
 from napari_fiberburst.settings import ENCODINGS, MOTIONS, choose
 
 
@@ -124,3 +126,19 @@ def test_changed_preferences_win_over_what_was_left():
     remember({"motion": "affine"}, usual)
     assert remembered(usual) == {"motion": "affine"}
     assert remembered(Preferences(preset="paper", device="cpu")) == {"preset": "paper", "device": "cpu"}
+
+
+def test_an_open_section_grows_with_what_is_in_it(qtbot):
+    content, late = QWidget(), QLabel("there later")
+    QVBoxLayout(content).addWidget(late)
+    late.setFixedHeight(120)
+    late.hide()
+    made = section("Curves", content)
+    qtbot.addWidget(made)
+    made.show()
+    made.expand(animate=False)
+    before = made.content().maximumHeight()
+    late.show()
+    qtbot.waitUntil(lambda: made.content().maximumHeight() >= before + 100, timeout=2000)
+    made.collapse(animate=False)
+    assert made.content().maximumHeight() == 0

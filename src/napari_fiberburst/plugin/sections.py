@@ -29,6 +29,7 @@ def section(title: str, content: QWidget) -> QCollapsible:
     inside.setContentsMargins(0, _ABOVE_CONTENT, 0, 0)
     inside.addWidget(content)
     made.setContent(holder)
+    holder.installEventFilter(made)
     made.collapse(animate=False)
     made.toggled.connect(lambda is_open: made.setText(unfolded if is_open else folded))
     return made
