@@ -105,6 +105,7 @@ def _plot(label: str, *, log: bool = False) -> pyqtgraph.PlotWidget:
     plot.setFixedHeight(_HEIGHT)
     plot.setLogMode(y=log)
     plot.setLabel("left", label)
+    plot.getAxis("left").enableAutoSIPrefix(False)  # "x0.001" on an axis of powers of ten helps nobody
     plot.setLabel("bottom", "seconds")
     plot.addLegend(offset=(-5, 5), labelTextSize="8pt")
     plot.setMenuEnabled(False)
