@@ -16,10 +16,10 @@ import psutil
 from benchmarks.results import COST, Results, Row
 from napari_fiberburst import Progress, reconstruct
 from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.pipeline.reconstruct import iterate
+from napari_fiberburst.pipeline.spline import SelfCalibrated
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import simulate
-from napari_fiberburst.solver import iterate
-from napari_fiberburst.solver.selfcalibrated import SelfCalibrated
 
 # Frames, side, channels: one of them grows while the others stay.
 SIZES = (

@@ -18,10 +18,10 @@ from benchmarks.cases import Case
 from benchmarks.peers import inpainting, unet
 from napari_fiberburst import Progress, Reconstruction, reconstruct
 from napari_fiberburst.errors import FiberBurstError, SettingsError
+from napari_fiberburst.pipeline.spline import SelfCalibrated
 from napari_fiberburst.quality import psnr
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import SimulatedBurst
-from napari_fiberburst.solver.selfcalibrated import SelfCalibrated
 
 Picture = NDArray[np.float32]
 WIDTHS = np.arange(0.5, 8.1, 0.25)

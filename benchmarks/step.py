@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import torch
 
-from napari_fiberburst.fields import JointField
+from napari_fiberburst.networks.field import JointField
+from napari_fiberburst.pipeline.problem import BETAS, Problem
+from napari_fiberburst.pipeline.reconstruct import iterate
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import simulate
-from napari_fiberburst.solver import iterate
-from napari_fiberburst.solver.problem import BETAS, Problem
 
 SHAPE = (256, 256)
 PAIRS = 15

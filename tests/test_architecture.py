@@ -8,29 +8,33 @@ import napari_fiberburst
 ROOT = Path(napari_fiberburst.__file__).parent
 
 # Each part may import itself and those named here.
-BASE = {"errors", "knobs", "choices", "settings", "control", "burst", "evidence"}
+BASE = {"errors", "settings", "control", "data"}
+STEPS = {"bundle", "motion", "scene"}
+RESULTS = BASE | {"io", "results"}
 ALLOWED = {
     "errors": set(),
-    "knobs": {"errors"},
-    "choices": {"errors", "knobs"},
-    "settings": {"errors", "knobs", "choices"},
-    "evidence": set(),
-    "control": {"errors", "knobs", "settings"},
-    "burst": {"errors"},
+    "settings": {"errors"},
+    "control": {"errors", "settings"},
+    "data": {"errors"},
+    "coordinates": set(),
+    "homography": set(),
+    "device": {"errors"},
     "io": BASE,
     "simulation": BASE,
-    "reconstruction": BASE | {"io"},
     "quality": BASE,
-    "geometry": BASE,
-    "optics": BASE | {"geometry"},
-    "fields": BASE | {"geometry"},
-    "solver": BASE | {"io", "reconstruction", "quality", "geometry", "optics", "fields"},
-    "cli": BASE | {"io", "simulation", "reconstruction", "quality", "solver", ""},
+    "results": BASE | {"io"},
+    "operators": BASE | {"coordinates", "homography"},
+    "bundle": BASE | {"coordinates", "homography", "operators"},
+    "motion": BASE | {"coordinates", "homography", "operators", "bundle"},
+    "scene": BASE | {"coordinates", "homography", "operators", "bundle", "quality"},
+    "networks": RESULTS | {"coordinates", "homography", "operators", "device", *STEPS},
+    "pipeline": RESULTS | {"coordinates", "homography", "operators", "device", "quality", "networks", *STEPS},
+    "cli": RESULTS | {"simulation", "quality", "networks", "pipeline", ""},
     "memory": BASE,
     "streaming": set(),
-    "plugin": BASE | {"io", "simulation", "reconstruction", "quality", "solver", "memory", "streaming"},
+    "plugin": RESULTS | {"simulation", "quality", "networks", "device", "pipeline", "memory", "streaming"},
 }
-TORCH = {"geometry", "optics", "fields", "solver"}
+TORCH = {"homography", "device", "operators", "bundle", "motion", "scene", "networks", "pipeline"}
 QT = {"qtpy", "magicgui", "superqt", "napari", "pyqtgraph"}
 
 

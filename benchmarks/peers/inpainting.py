@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from napari_fiberburst.fields.scene import make_scene
+from napari_fiberburst.networks.scene import make_scene
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import Bundle
 

@@ -10,30 +10,30 @@ if TYPE_CHECKING:
     from napari_fiberburst import quality as quality
     from napari_fiberburst import settings as settings
     from napari_fiberburst import simulation as simulation
-    from napari_fiberburst.burst import Burst as Burst
     from napari_fiberburst.control import Control as Control
+    from napari_fiberburst.data.burst import Burst as Burst
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
     from napari_fiberburst.io import read_burst as read_burst
-    from napari_fiberburst.reconstruction import Reconstruction as Reconstruction
+    from napari_fiberburst.networks.image import load as load
+    from napari_fiberburst.pipeline.reconstruct import iterate as iterate
+    from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
+    from napari_fiberburst.results.progress import Progress as Progress
+    from napari_fiberburst.results.reconstruction import Reconstruction as Reconstruction
     from napari_fiberburst.settings import Settings as Settings
-    from napari_fiberburst.solver import Progress as Progress
-    from napari_fiberburst.solver import iterate as iterate
-    from napari_fiberburst.solver import load as load
-    from napari_fiberburst.solver import reconstruct as reconstruct
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Burst": "burst",
+    "Burst": "data.burst",
     "Control": "control",
     "FiberBurstError": "errors",
-    "Progress": "solver",
-    "Reconstruction": "reconstruction",
+    "Progress": "results.progress",
+    "Reconstruction": "results.reconstruction",
     "Settings": "settings",
-    "iterate": "solver",
-    "load": "solver",
+    "iterate": "pipeline.reconstruct",
+    "load": "networks.image",
     "read_burst": "io",
-    "reconstruct": "solver",
+    "reconstruct": "pipeline.reconstruct",
 }
 
 _MODULES = ("quality", "settings", "simulation")

@@ -4,8 +4,8 @@ import threading
 from collections.abc import Callable
 
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.knobs import knobs_of
 from napari_fiberburst.settings import Fourier, Settings
+from napari_fiberburst.settings.parameter import knobs_of
 
 _KNOBS = {"sigma": knobs_of(Fourier)["sigma"], "learning_rate": knobs_of(Settings)["learning_rate"]}
 # How often a paused run asks whether it should end.

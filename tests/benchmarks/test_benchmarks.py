@@ -17,7 +17,7 @@ from benchmarks import __main__ as command
 from benchmarks import cases, chart, methods, publish, report
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.quality import psnr
-from napari_fiberburst.reconstruction import Canvas
+from napari_fiberburst.results.reconstruction import Canvas
 
 SMALL = Case(name="small", scene="cat", side=80, pitch=4.0, frames=6, seed=3)
 

@@ -10,7 +10,7 @@ from napari.layers import Image
 from napari.utils import progress
 from napari.utils.notifications import notification_manager
 
-from napari_fiberburst import solver
+from napari_fiberburst.pipeline import reconstruct as pipeline
 from napari_fiberburst.plugin.dock import FiberBurstWidget
 
 MILLISECONDS = 60_000
@@ -30,7 +30,7 @@ def test_an_error_in_the_solver_leaves_the_form_ready(open_dock, qtbot, burst_la
     def broken(*args, **choices):
         raise error
 
-    monkeypatch.setattr(solver, "reconstruct", broken)
+    monkeypatch.setattr(pipeline, "reconstruct", broken)
     viewer, dock = open_dock(burst_layer)
     seen = []
     for name in ("finished", "stopped", "failed", "ready"):
@@ -47,14 +47,14 @@ def test_an_error_in_the_solver_leaves_the_form_ready(open_dock, qtbot, burst_la
 
 
 def test_a_picture_without_numbers_is_a_failure(open_dock, qtbot, burst_layer, monkeypatch):
-    right = solver.reconstruct
+    right = pipeline.reconstruct
 
     def blind(*args, **choices):
         result = right(*args, **choices)
         result.image[:] = np.nan
         return result
 
-    monkeypatch.setattr(solver, "reconstruct", blind)
+    monkeypatch.setattr(pipeline, "reconstruct", blind)
     _, dock = open_dock(burst_layer)
     with qtbot.waitSignal(dock.runner.failed, timeout=MILLISECONDS) as failed:
         dock.start()

@@ -3,7 +3,7 @@
 import numpy as np
 from napari.layers import Image
 
-from napari_fiberburst import solver
+from napari_fiberburst.pipeline import reconstruct as pipeline
 from napari_fiberburst.plugin.dock import FiberBurstWidget
 
 MILLISECONDS = 60_000
@@ -39,7 +39,7 @@ def test_one_click_makes_a_picture(open_dock, run_through, burst_layer, simulate
 def test_the_plugin_runs_the_same_reconstruction_as_a_script(open_dock, run_through, burst_layer, simulated):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
-    headless = solver.reconstruct(simulated.arrays()["frames"])
+    headless = pipeline.reconstruct(simulated.arrays()["frames"])
     # Sums in another thread may be taken in another order.
     np.testing.assert_allclose(run.result.image, headless.image, rtol=1e-4)
     np.testing.assert_allclose(run.result.homographies, headless.homographies, atol=1e-6)

@@ -11,14 +11,14 @@ from napari.layers import Image, Shapes
 from napari.layers._source import Source
 
 from napari_fiberburst.errors import BurstError, FiberBurstError
-from napari_fiberburst.evidence import Cores
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
 from napari_fiberburst.plugin.calls import as_command, as_python
 from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.plugin.history import History, Moment
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
-from napari_fiberburst.reconstruction import Canvas
+from napari_fiberburst.results.diagnostics import Cores
+from napari_fiberburst.results.reconstruction import Canvas
 
 
 def image(*shape, **look):

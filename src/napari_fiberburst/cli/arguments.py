@@ -3,8 +3,8 @@
 import argparse
 from typing import Any, NoReturn
 
-from napari_fiberburst.knobs import Knob, knobs_of
 from napari_fiberburst.settings import ENCODINGS, MOTIONS, PRESETS, PUBLISHED_MOTIONS, Settings, choice_docs
+from napari_fiberburst.settings.parameter import Knob, knobs_of
 
 _OWNERS = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
 

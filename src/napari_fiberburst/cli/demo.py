@@ -11,11 +11,11 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 from tqdm import tqdm
 
-from napari_fiberburst.burst import Burst
+from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.quality import match_levels, motion_error, psnr, ssim
-from napari_fiberburst.reconstruction import Reconstruction
+from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.simulation import simulate
 
 # A bundle as real ones are: each core shows one value, the mean of what it gathers.
@@ -67,7 +67,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _fit(burst: Burst, device: str) -> Reconstruction:
     """Return the reconstruction, with a progress bar meanwhile."""
-    from napari_fiberburst.solver import Progress, reconstruct  # torch takes seconds to load
+    from napari_fiberburst.pipeline.reconstruct import reconstruct  # torch takes seconds to load
+    from napari_fiberburst.results.progress import Progress
 
     with tqdm(unit="it", desc="reconstructing") as bar:
 

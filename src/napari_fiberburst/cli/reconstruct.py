@@ -58,7 +58,8 @@ def run(options: argparse.Namespace) -> int:
         burst = burst.crop(*options.crop)
     print(burst)
     # torch takes seconds to load: all that can be refused has been by now.
-    from napari_fiberburst.solver import Progress, reconstruct
+    from napari_fiberburst.pipeline.reconstruct import reconstruct
+    from napari_fiberburst.results.progress import Progress
 
     control = Control()
     with stop_on_interrupt(control), tqdm(total=settings.iterations, unit="it") as bar:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_fiberburst.burst import Burst
+from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.folder import PICTURE_ENDINGS, read_pictures
 from napari_fiberburst.io.recording import Recording

@@ -17,7 +17,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from napari_fiberburst.burst import Acquisition
+from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import OutputError
 
 PICTURE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")

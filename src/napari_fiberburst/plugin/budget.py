@@ -45,7 +45,7 @@ def memory_of(source: BurstSource, choices: Mapping[str, Any], missing: Mapping[
     settings = choose(**choices)
     free = psutil.virtual_memory().available
     if missing is not None and "cuda" not in missing:
-        from napari_fiberburst.solver.device import free_memory
+        from napari_fiberburst.device import free_memory
 
         free = free_memory(settings.device) or free
     return estimate_memory(source.shape, settings), free

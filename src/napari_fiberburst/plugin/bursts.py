@@ -9,7 +9,7 @@ import tifffile
 from napari.layers import Image, Shapes
 from numpy.typing import NDArray
 
-from napari_fiberburst.burst import MIN_SIDE, Burst
+from napari_fiberburst.data.burst import MIN_SIDE, Burst
 from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY

@@ -14,7 +14,7 @@ import tifffile
 from napari_fiberburst.plugin import METADATA_KEY
 
 if TYPE_CHECKING:
-    from napari_fiberburst.burst import Burst
+    from napari_fiberburst.data.burst import Burst
 
 LayerData = tuple[Any, dict[str, Any], str]
 _PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"

@@ -18,7 +18,7 @@ from napari_fiberburst.plugin.runs import KeptRun
 from napari_fiberburst.plugin.sections import section
 
 if TYPE_CHECKING:
-    from napari_fiberburst.solver import Progress
+    from napari_fiberburst.results.progress import Progress
 
 # Per cent of an animation's own pace.
 _CALM, _USUAL = 4, 100

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import napari
     from napari.layers import Layer
 
-    from napari_fiberburst.solver import Progress
+    from napari_fiberburst.results.progress import Progress
 
 _WIDTH = 350
 _FIRST_THING_TO_PRESS = "QPushButton:enabled { background-color: #2f6fd0; color: white; font-weight: bold; }"

@@ -7,7 +7,6 @@ from qtpy.QtCore import Qt, Signal
 from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.knobs import Knob, knobs_of
 from napari_fiberburst.plugin.knob_rows import KnobRow
 from napari_fiberburst.plugin.sections import form_layout, section
 from napari_fiberburst.settings import (
@@ -19,6 +18,7 @@ from napari_fiberburst.settings import (
     choice_docs,
     choose,
 )
+from napari_fiberburst.settings.parameter import Knob, knobs_of
 
 # Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides.
 _FIRST = ("sigma", "smoothness", "iterations", "time_budget", "device", "canvas", "upsample")

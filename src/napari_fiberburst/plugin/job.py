@@ -16,9 +16,9 @@ from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.streaming import Latest
 
 if TYPE_CHECKING:
-    from napari_fiberburst.burst import Acquisition
-    from napari_fiberburst.reconstruction import Reconstruction
-    from napari_fiberburst.solver import Progress
+    from napari_fiberburst.data.burst import Acquisition
+    from napari_fiberburst.results.progress import Progress
+    from napari_fiberburst.results.reconstruction import Reconstruction
 
 logger = logging.getLogger(__name__)
 
@@ -121,7 +121,7 @@ class Job:
     def run(self, should_stop: Callable[[], bool]) -> None:
         """Make the call; raises nothing, for a worker's errors reach the window by more than one way."""
         # torch takes seconds to load, which the window must not wait for.
-        from napari_fiberburst.solver import reconstruct
+        from napari_fiberburst.pipeline.reconstruct import reconstruct
 
         assert self._source is not None
         try:
@@ -226,6 +226,6 @@ def _explain(error: Exception) -> str:
 
 def load_solver() -> dict[str, str]:
     """Load PyTorch, which takes seconds, ahead of the first run; return the devices that are not here, and why."""
-    from napari_fiberburst.solver.device import missing_devices
+    from napari_fiberburst.device import missing_devices
 
     return missing_devices()

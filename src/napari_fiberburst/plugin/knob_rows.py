@@ -6,7 +6,7 @@ from qtpy.QtCore import Signal
 from qtpy.QtGui import QValidator
 from qtpy.QtWidgets import QCheckBox, QComboBox, QDoubleSpinBox, QHBoxLayout, QLineEdit, QSpinBox, QWidget
 
-from napari_fiberburst.knobs import Knob
+from napari_fiberburst.settings.parameter import Knob
 
 _MOST_INTEGER = 2**31 - 1
 _LARGEST = 1e9

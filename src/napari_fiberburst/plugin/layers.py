@@ -9,13 +9,13 @@ from napari.components import ViewerModel
 from napari.layers import Image, Layer, Shapes, Tracks
 from numpy.typing import NDArray
 
-from napari_fiberburst.burst import Acquisition
+from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
 
 if TYPE_CHECKING:
-    from napari_fiberburst.reconstruction import Canvas, Reconstruction
+    from napari_fiberburst.results.reconstruction import Canvas, Reconstruction
 
 # Outlines are drawn anew at most this often, for a layer of shapes is slow to come and to change.
 _SECONDS_BETWEEN_OUTLINES = 5.0

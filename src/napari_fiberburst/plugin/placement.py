@@ -8,8 +8,8 @@ import numpy as np
 from napari.layers import Image
 from numpy.typing import NDArray
 
-from napari_fiberburst.burst import Acquisition
-from napari_fiberburst.reconstruction import Canvas
+from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.results.reconstruction import Canvas
 
 # Parts of a picture's values that are let go below and above when its contrast is set.
 _DARKEST, _BRIGHTEST = 0.1, 99.9

@@ -11,7 +11,7 @@ from qtpy.QtCore import QObject, QTimer, Signal
 from napari_fiberburst.plugin.job import Job
 
 if TYPE_CHECKING:
-    from napari_fiberburst.solver import Progress
+    from napari_fiberburst.results.progress import Progress
 
 # The window is brought up to date ten times a second, or less often where that would take more than this part of the
 # time: where the canvas is drawn in software, as on remote desktops, the fit needs those processors.

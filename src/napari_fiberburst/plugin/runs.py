@@ -31,7 +31,7 @@ from napari_fiberburst.settings import Spline
 if TYPE_CHECKING:
     from napari.layers import Layer
 
-    from napari_fiberburst.reconstruction import Reconstruction
+    from napari_fiberburst.results.reconstruction import Reconstruction
 
 _LINES_OF_RUNS = 4
 _MORE_STEPS = 200

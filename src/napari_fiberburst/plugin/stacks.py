@@ -10,8 +10,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 if TYPE_CHECKING:
-    from napari_fiberburst.evidence import Cores
-    from napari_fiberburst.reconstruction import Canvas
+    from napari_fiberburst.results.diagnostics import Cores
+    from napari_fiberburst.results.reconstruction import Canvas
 
 
 def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas") -> da.Array:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_fiberburst.burst import MIN_FRAMES, MIN_SIDE, Burst
+from napari_fiberburst.data.burst import MIN_FRAMES, MIN_SIDE, Burst
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.simulation.bundle import Bundle, make_bundle
 from napari_fiberburst.simulation.camera import Camera

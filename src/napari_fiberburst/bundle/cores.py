@@ -1,0 +1,132 @@
+"""Find cores in a picture of even light, and which pixels show which core."""
+
+import math
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from napari_fiberburst.operators.grid import blur, local_mean
+
+# In pitches: how far a core's light is counted as its own, and how far from all cores a place is a gap in the lattice.
+REACH = 0.62
+_GAP = 0.85
+# A core is a blob: two Gaussians of these spreads, in pitches, subtracted. Plain peaks would miss a dim core that leans
+# on a bright one.
+_INNER, _OUTER = 0.15, 0.3
+# The mean profile is a broken line with knots this far apart, out to where neighbours of neighbours begin; what lies
+# within the second reach is a core's own. In pitches. So many pixels are plenty.
+_PROFILE_STEP, _PROFILE_REACH, _OWN_REACH = 0.1, 1.3, 0.7
+_PROFILE_PIXELS = 20_000
+# How strong a blob is a core, in parts of the light about it; and how much light there must be about it, for noise
+# outside the bundle has blobs too.
+_LEAST_BLOB = 0.06
+_LEAST_LIGHT = 0.15
+
+
+def find_cores(picture: Tensor, pitch: float, outline: Tensor) -> NDArray[np.float64]:
+    """Return core centres (N, 2) as (x, y), to a fraction of a pixel.
+
+    Blobs of the size of a core, moved to the centroid of the light about them.
+
+    Parameters
+    ----------
+    picture : Tensor
+        (H, W), how bright each pixel is in even light, about 1 on average.
+    pitch : float
+        Distance of neighbouring cores, pixels.
+    outline : Tensor
+        (H, W) bool, where the bundle is.
+    """
+    blob = blur(picture, max(0.4, _INNER * pitch)) - blur(picture, max(0.55, _OUTER * pitch))
+    around = local_mean(picture, 0.7 * pitch)
+    is_core = (blob == _extreme(blob, round(0.2 * pitch))) & (blob > _LEAST_BLOB * around)
+    is_core &= outline & (around > _LEAST_LIGHT)
+    peaks = is_core.nonzero().flip(1).cpu().numpy().astype(np.float64)
+    if len(peaks) == 0:
+        return peaks
+    light = picture.square().cpu().numpy().ravel().astype(np.float64)
+    labels = nearest_core(peaks, outline.cpu().numpy(), REACH * pitch).ravel()
+    own = labels < len(peaks)
+    y, x = (part.ravel()[own] for part in np.indices(picture.shape))
+    total, along_x, along_y = (
+        np.bincount(labels[own], light[own] * weight, len(peaks)) for weight in (np.ones(len(x)), x, y)
+    )
+    found = total > 0
+    return np.stack([along_x[found] / total[found], along_y[found] / total[found]], axis=1)
+
+
+def nearest_core(centres: NDArray[np.float64], outline: NDArray[np.bool_], reach: float) -> NDArray[np.int64]:
+    """Return the number of the core nearest to each pixel, (H, W); N where none is within `reach` pixels.
+
+    Pixels outside the bundle's `outline`, (H, W), belong to none.
+    """
+    labels = np.full(outline.shape, len(centres), dtype=np.int64)
+    y, x = np.nonzero(outline)
+    tree = cKDTree(centres)
+    labels[y, x] = tree.query(np.stack([x, y], axis=1), distance_upper_bound=reach, workers=-1)[1]
+    return labels
+
+
+def find_gaps(centres: NDArray[np.float64], outline: NDArray[np.bool_], pitch: float) -> NDArray[np.float64]:
+    """Return where the lattice has a place but no light, (M, 2): dead cores."""
+    if len(centres) < 6:
+        return np.empty((0, 2))
+    y, x = np.nonzero(outline)
+    distance = np.zeros(outline.shape)
+    distance[y, x] = cKDTree(centres).query(np.stack([x, y], axis=1), workers=-1)[0]
+    field = torch.from_numpy(distance)
+    is_gap = (field == _extreme(field, round(0.5 * pitch))) & (field > _GAP * pitch)
+    gaps = is_gap.nonzero().flip(1).numpy().astype(np.float64)
+    # At the rim the lattice simply ends: a gap has cores on all sides.
+    if len(gaps) == 0:
+        return gaps
+    _, near = cKDTree(centres).query(gaps, k=6)
+    middle = centres[near].mean(axis=1)
+    inside: NDArray[np.float64] = gaps[np.hypot(*(gaps - middle).T) < 0.6 * pitch]
+    return inside
+
+
+def brightest(transmission: Tensor, labels: Tensor, count: int, pitch: float) -> Tensor:
+    """Return how bright each core is where it is brightest, (N,)."""
+    own = labels < count
+    smooth = blur(transmission, max(0.1 * pitch, 0.3))
+    return torch.zeros(count).to(smooth).scatter_reduce(0, labels[own], smooth[own], "amax").clamp_min(1e-6)
+
+
+def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitch: float) -> float:
+    """Return the radius, in pixels, of the disc with the spread of the mean core's profile.
+
+    A core gathers light over the area through which it emits it. Profiles of neighbours overlap, so the mean profile is
+    unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for all cores (least
+    squares, not negative). Its second moment is taken as far as it is a core's own; farther out lies stray light.
+    """
+    gains = brightest(transmission, labels, len(centres), pitch).cpu().numpy()
+    y, x = np.nonzero((labels < len(centres)).cpu().numpy())
+    some = slice(None, None, max(1, len(x) // _PROFILE_PIXELS))
+    x, y = x[some], y[some]
+    distance, nearest = cKDTree(centres.cpu().numpy()).query(np.stack([x, y], axis=1), k=8)
+    place = np.asarray(distance) / (_PROFILE_STEP * pitch)
+    knots = math.ceil(_PROFILE_REACH / _PROFILE_STEP) + 1
+    below = np.minimum(place.astype(int), knots)
+    design = np.zeros((len(x), knots + 2))
+    pixel = np.broadcast_to(np.arange(len(x))[:, None], place.shape)
+    gain = gains[nearest]
+    np.add.at(design, (pixel, below), gain * (1 - place + below).clip(0, 1))
+    np.add.at(design, (pixel, below + 1), gain * (place - below).clip(0, 1))
+    profile, _ = nnls(design[:, :knots], transmission.cpu().numpy()[y, x].astype(np.float64))
+    radius = np.linspace(0, _OWN_REACH, 200)
+    light = np.interp(radius, np.arange(knots) * _PROFILE_STEP, profile)
+    if not light.any():
+        return 0.36 * pitch
+    return float(pitch * math.sqrt(2 * (light * radius**3).sum() / (light * radius).sum()))
+
+
+def _extreme(picture: Tensor, reach: int) -> Tensor:
+    """Return the largest value within `reach` pixels, square-wise."""
+    reach = max(1, reach)
+    return F.max_pool2d(picture[None], 2 * reach + 1, stride=1, padding=reach)[0]

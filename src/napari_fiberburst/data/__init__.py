@@ -1,0 +1,1 @@
+"""What comes in: bursts of frames."""

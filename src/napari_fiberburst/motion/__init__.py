@@ -1,0 +1,1 @@
+"""Step 2: how the object moves from frame to frame."""

@@ -1,0 +1,192 @@
+"""Registration without honeycomb: from core samples to the transform of every frame, and how far to trust it.
+
+Coarse, by cross-correlation normalised by the overlap (Padfield, 2012): whitened phase correlation locks on the bundle
+or on noise. All pairs vote, and the best-connected tree of pairs gives the shifts, so motion may exceed the field as
+long as some frames overlap. Fine, by `napari_fiberburst.motion.joint`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.operators.grid import Grid, blur
+
+# Pictures for the coarse search have at most this many pixels a side.
+_MOST_SIDE = 128
+# Pairs need this much of the field in common; less is by chance too often alike.
+_LEAST_OVERLAP = 0.12
+# Up to this many frames every pair is tried; beyond, neighbours in time and every frame with these many landmarks.
+_ALL_PAIRS = 20
+_NEIGHBOURS = 3
+_LANDMARKS = 8
+# Pictures that are this little alike do not show the same thing.
+LEAST_CONFIDENCE = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseShifts:
+    """Where each frame lies, by shifts alone.
+
+    Attributes
+    ----------
+    shifts : numpy.ndarray
+        (T, 2) pixels, frame to scene.
+    confidence : numpy.ndarray
+        (T,) correlation, 0 to 1, of the pair that ties a frame to the others.
+    connected : numpy.ndarray
+        (T,) bool, frames that are tied to the best-connected one.
+    """
+
+    shifts: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+    connected: NDArray[np.bool_]
+
+
+def find_shifts(
+    positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], pitch: float
+) -> CoarseShifts:
+    """Find the shift of every frame to within about a pitch.
+
+    Parameters
+    ----------
+    positions : Tensor
+        (N, 2) of the sensors, frame pixels.
+    values, weights : Tensor
+        (T, N).
+    shape : (int, int)
+        Height and width of a frame.
+    pitch : float
+        Distance of sensors, pixels.
+    """
+    spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
+    pictures, mask = _pictures(positions, values, weights, shape, spacing, max(0.5, 0.6 * pitch / spacing))
+    correlation = _Correlation(pictures, mask)
+    count = len(pictures)
+    scores = np.zeros((count, count))
+    ways = np.zeros((count, count, 2))
+    for first, second in _pairs(count):
+        way, score = correlation.best(first, second)
+        scores[first, second] = scores[second, first] = score
+        ways[first, second], ways[second, first] = way, -way
+    return _span(scores, ways * spacing)
+
+
+def confidence(
+    positions: Tensor, values: Tensor, weights: Tensor, motion: FrameMotion, pitch: float
+) -> NDArray[np.float64]:
+    """Return how well each frame agrees with the mean of all others where they overlap: correlation, 0 to 1."""
+    points = motion.apply(positions)
+    grid = Grid.around(points, 0.7 * pitch, 2 * pitch)
+    at = [grid.at(frame) for frame in points]
+    totals = torch.stack(
+        [torch.stack([a.write(v * w), a.write(w)]) for a, v, w in zip(at, values, weights, strict=True)]
+    )
+    totals = blur(totals, 0.8)
+    others = totals.sum(dim=0) - totals
+    found = []
+    for a, own, (light, mass), (own_light, own_mass) in zip(at, weights, others, totals, strict=True):
+        enough = a.read(mass) > 0.5 * own.mean()
+        weight = own * enough * a.inside
+        here = a.read(own_light) / a.read(own_mass).clamp_min(1e-9)
+        there = a.read(light) / a.read(mass).clamp_min(1e-9)
+        found.append(_correlation(here, there, weight))
+    return np.array(found)
+
+
+def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> float:
+    total = float(weight.sum())
+    if total <= 0:
+        return 0.0
+    first = first - (weight * first).sum() / total
+    second = second - (weight * second).sum() / total
+    power = float((weight * first**2).sum() * (weight * second**2).sum())
+    return max(0.0, float((weight * first * second).sum()) / power**0.5) if power > 0 else 0.0
+
+
+def _pictures(
+    positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], spacing: float, sigma: float
+) -> tuple[Tensor, Tensor]:
+    """Return the frames as small pictures (T, h, w), and where there is something to see, (T, h, w)."""
+    height, width = shape
+    at = Grid.over((0, 0, width - 1, height - 1), spacing).at(positions)
+    light = blur(torch.stack([at.write(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
+    mass = blur(torch.stack([at.write(w) for w in weights]), sigma)
+    mask = mass > 0.2 * mass.mean()
+    return torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask
+
+
+def _pairs(count: int) -> Iterator[tuple[int, int]]:
+    landmarks = set(np.linspace(0, count - 1, _LANDMARKS).astype(int).tolist())
+    for first in range(count):
+        for second in range(first + 1, count):
+            if count <= _ALL_PAIRS or second - first <= _NEIGHBOURS or first in landmarks or second in landmarks:
+                yield first, second
+
+
+class _Correlation:
+    """Correlation coefficients of pairs of masked pictures, over their overlap, for every shift at once."""
+
+    def __init__(self, pictures: Tensor, masks: Tensor) -> None:
+        self._shape = tuple(int(next_fast_len(2 * side, real=True)) for side in pictures.shape[1:])
+        masks = masks.to(pictures.dtype)
+        mass = masks.sum(dim=(1, 2), keepdim=True).clamp_min(1)
+        centred = (pictures - (pictures * masks).sum(dim=(1, 2), keepdim=True) / mass) * masks
+        self._area = masks.sum(dim=(1, 2))
+        self._power = centred.square().sum(dim=(1, 2))
+        self._masks, self._values, self._squares = (
+            torch.fft.rfft2(part, s=self._shape) for part in (masks, centred, centred.square())
+        )
+
+    def best(self, first: int, second: int) -> tuple[NDArray[np.float64], float]:
+        """Return the shift (x, y) from the second picture to the first, in their pixels, and its score."""
+        area = torch.minimum(self._area[first], self._area[second])
+        if not float(area) > 0:
+            return np.zeros(2), 0.0
+        overlap = self._correlate(self._masks[first], self._masks[second]).clamp_min(1e-3)
+        sums = self._correlate(self._values[first], self._masks[second])
+        sums_second = self._correlate(self._masks[first], self._values[second])
+        power = self._correlate(self._squares[first], self._masks[second]) - sums**2 / overlap
+        power_second = self._correlate(self._masks[first], self._squares[second]) - sums_second**2 / overlap
+        joint = self._correlate(self._values[first], self._values[second]) - sums * sums_second / overlap
+        # Flat patches correlate by noise: a share of the whole picture's power steadies the norm.
+        share = overlap / area
+        norm = (power.clamp_min(0) + 0.02 * share * self._power[first]) * (
+            power_second.clamp_min(0) + 0.02 * share * self._power[second]
+        )
+        score = joint / norm.sqrt().clamp_min(1e-12) * share.clamp(0, 1) ** 0.25
+        score = torch.where(share > _LEAST_OVERLAP, score, torch.full_like(score, -1))
+        place = int(score.argmax())
+        way = [place % self._shape[1], place // self._shape[1]]
+        for axis, side in enumerate(self._shape[::-1]):
+            way[axis] -= side if way[axis] > side // 2 else 0
+        return -np.array(way, dtype=np.float64), max(0.0, float(score.max()))
+
+    def _correlate(self, first: Tensor, second: Tensor) -> Tensor:
+        correlated: Tensor = torch.fft.irfft2(first.conj() * second, s=self._shape)
+        return correlated
+
+
+def _span(scores: NDArray[np.float64], ways: NDArray[np.float64]) -> CoarseShifts:
+    """Tie frames to one another along the tree of the best pairs; `ways[i, j]` leads from frame j's pixels to i's."""
+    count = len(scores)
+    root = int(np.argmax(np.median(scores, axis=1)))
+    shifts = np.zeros((count, 2))
+    trust = np.zeros(count)
+    connected = np.zeros(count, dtype=bool)
+    connected[root] = True
+    for _ in range(count - 1):
+        open_pairs = np.where(connected[:, None] & ~connected[None, :], scores, -1.0)
+        known, new = np.unravel_index(int(open_pairs.argmax()), open_pairs.shape)
+        if scores[known, new] < LEAST_CONFIDENCE:
+            break
+        shifts[new] = shifts[known] + ways[known, new]
+        trust[new] = scores[known, new]
+        connected[new] = True
+    trust[root] = trust.max()
+    return CoarseShifts(shifts, trust, connected)

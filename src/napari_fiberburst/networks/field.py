@@ -1,0 +1,38 @@
+"""The joint field: what every frame of the burst should show."""
+
+import torch
+from torch import Tensor, nn
+
+from napari_fiberburst.networks.motion import make_motion
+from napari_fiberburst.networks.scene import make_scene
+from napari_fiberburst.settings import Settings
+
+
+class JointField(nn.Module):
+    """I_hat(x, y, t) = f(gamma(T_g(x, y, t))), "Seeing through fibers" (2026).
+
+    Parameters
+    ----------
+    settings : Settings
+        Motion, encoding and sizes of the networks, and the seed of their start.
+    frames, channels : int
+        Of the burst.
+    start : Tensor, optional
+        (T, 3, 3) homographies in unit coordinates, from a registration.
+    """
+
+    def __init__(self, settings: Settings, frames: int, channels: int, start: Tensor | None = None) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(settings.seed)
+        self.motion = make_motion(settings.motion, frames, generator, start)
+        self.scene = make_scene(settings, self.motion.scene_dimensions, channels, generator)
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return intensities (N, C) in [-1, 1] at `points` (N, 2), unit coordinates, of frames (N,)."""
+        intensities: Tensor = self.scene(self.motion(points, frames))
+        return intensities
+
+    @property
+    def parameter_count(self) -> int:
+        """Numbers that are fitted; random frequencies are not among them."""
+        return sum(parameter.numel() for parameter in self.parameters())

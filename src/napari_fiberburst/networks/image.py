@@ -1,0 +1,193 @@
+"""The fitted field as a compressed representation of the burst: drawn at any size, saved, loaded, continued."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.coordinates import in_pixels, unit_from_pixel
+from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.device import find_device
+from napari_fiberburst.errors import FiberBurstError, OutputError
+from napari_fiberburst.homography import relative_to_first
+from napari_fiberburst.io.results import read_representation
+from napari_fiberburst.networks.field import JointField
+from napari_fiberburst.results.reconstruction import Canvas, Reconstruction, draw
+from napari_fiberburst.scene.image import SplinePicture
+from napari_fiberburst.settings import Settings, Spline
+
+# Points drawn at a time: the widest layer's activations of this many take some 50 MB.
+_CHUNK = 16_384
+_DRAWN = "samples_drawn"
+_BEHIND = "behind."
+
+
+class Representation:
+    """A fitted joint field with what is needed to draw it and to go on fitting it.
+
+    Parameters
+    ----------
+    field : JointField
+        On the device where it is drawn.
+    frame_shape : (int, int)
+        Height and width of the burst's frames.
+    optimizer_state : dict or None
+        Adam's moments, to continue exactly; None starts them afresh.
+    drawn : int
+        Samples drawn so far.
+    behind : SplinePicture, optional
+        The first picture of a calibrated burst: it knows what no core has looked at, how frames lie, and what
+        intensity stands for no light.
+    """
+
+    def __init__(
+        self,
+        field: JointField,
+        frame_shape: tuple[int, int],
+        optimizer_state: dict[str, Any] | None = None,
+        drawn: int = 0,
+        behind: SplinePicture | None = None,
+    ) -> None:
+        self.behind = behind
+        self.field = field
+        self.frame_shape = frame_shape
+        self.optimizer_state = optimizer_state
+        self.drawn = drawn
+        self._unit_from_pixel = unit_from_pixel(frame_shape)
+
+    def render(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
+        """Return the scene as `frame` sees it, (H, W, C) in [0, 1], at that frame's pixels `points` (H, W, 2)."""
+
+        def intensities(unit: Tensor, frames: Tensor) -> Tensor:
+            shown: Tensor = self.field(unit, frames)
+            return (shown + 1) / 2
+
+        picture = self._by_chunks(intensities, points, frame)
+        return picture if self.behind is None else self.behind.masked(picture + self.behind.black, points, frame)
+
+    def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+        """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
+        if frame == 0 and self.behind is None:
+            return np.zeros_like(points)
+
+        def moves(unit: Tensor, frames: Tensor) -> Tensor:
+            return self.field.motion.frame0_points(unit, frames) - unit
+
+        return self._by_chunks(moves, points, frame) / np.diag(self._unit_from_pixel)[:2]
+
+    def homographies(self) -> NDArray[np.float64]:
+        """Return (T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that were left out."""
+        with torch.no_grad():
+            scene_from_frame = self.field.motion.scene_from_frame().cpu().numpy().astype(np.float64)
+        reference = 0 if self.behind is None else self.behind.reference
+        order = [reference, *(frame for frame in range(len(scene_from_frame)) if frame != reference)]
+        relative = np.empty_like(scene_from_frame)
+        relative[order] = relative_to_first(in_pixels(scene_from_frame[order], self.frame_shape))
+        if self.behind is not None:
+            relative[~self.behind.used] = np.nan
+        return relative
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the fitted parameters, the random frequencies and the samples drawn, by name."""
+        parameters = {name: value.cpu().numpy() for name, value in self.field.state_dict().items()}
+        behind = {} if self.behind is None else self.behind.arrays()
+        return {**parameters, _DRAWN: np.array(self.drawn), **{_BEHIND + name: part for name, part in behind.items()}}
+
+    def _by_chunks(
+        self, function: Callable[[Tensor, Tensor], Tensor], points: NDArray[np.float64], frame: int
+    ) -> NDArray[np.float32]:
+        device = self.field.motion.times.device
+        unit = points.reshape(-1, 2) * np.diag(self._unit_from_pixel)[:2] + self._unit_from_pixel[:2, 2]
+        parts = []
+        with torch.no_grad():
+            for start in range(0, len(unit), _CHUNK):
+                chunk = torch.from_numpy(unit[start : start + _CHUNK].astype(np.float32)).to(device)
+                frames = torch.full((len(chunk),), frame, device=device)
+                parts.append(function(chunk, frames).cpu())
+        values: NDArray[np.float32] = torch.cat(parts).numpy().reshape(*points.shape[:2], -1)
+        return values
+
+
+def load(path: str | Path, device: str = "auto") -> Reconstruction:
+    """Read a reconstruction that was saved as ``.npz``, to draw it at any size or to continue it.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    device : str
+        Where to draw it.
+
+    Returns
+    -------
+    Reconstruction
+        With the image drawn anew.
+
+    Raises
+    ------
+    OutputError
+        The file is not there or is no saved reconstruction.
+    DeviceError
+        The device is not on this machine.
+    """
+    place = find_device(device)
+    arrays, provenance = read_representation(path)
+    try:
+        return _rebuild(arrays, provenance, place)
+    except (FiberBurstError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        raise OutputError(f"{path} is no reconstruction that this version can read: {error!r}") from error
+
+
+def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
+    settings = Settings.from_dict(provenance["settings"])
+    acquisition = Acquisition.from_dict(provenance["burst"])
+    canvas = Canvas(
+        shape=tuple(provenance["canvas"]["shape"]),
+        frame0_from_image=np.array(provenance["canvas"]["frame0_from_image"]),
+    )
+    reference = int(provenance.get("reference", 0))
+    renderer: SplinePicture | Representation
+    if isinstance(settings.encoding, Spline):
+        renderer = SplinePicture.from_arrays(arrays, device)
+        homographies = renderer.homographies
+    else:
+        renderer = _rebuild_networks(arrays, settings, acquisition, device)
+        homographies = renderer.homographies()
+    return Reconstruction(
+        image=draw(renderer, canvas, reference, acquisition),
+        canvas=canvas,
+        homographies=homographies,
+        losses=np.array([np.nan if loss is None else loss for loss in provenance["losses"]], dtype=np.float32),
+        settings=settings,
+        seconds=float(provenance["seconds"]),
+        parameters=int(provenance["parameters"]),
+        device=str(device),
+        ending=provenance["ending"],
+        acquisition=acquisition,
+        renderer=renderer,
+        reference=reference,
+        sample_error=provenance.get("sample_error"),
+        frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
+        confidence=None
+        if provenance.get("confidence") is None
+        else np.array(provenance["confidence"], dtype=np.float64),
+        resolution=provenance.get("resolution"),
+        notes=tuple(provenance.get("notes", ())),
+    )
+
+
+def _rebuild_networks(
+    arrays: dict[str, NDArray[Any]], settings: Settings, acquisition: Acquisition, device: torch.device
+) -> Representation:
+    count, height, width, channels = acquisition.shape
+    drawn = int(arrays.pop(_DRAWN))
+    kept = {name.removeprefix(_BEHIND): arrays.pop(name) for name in list(arrays) if name.startswith(_BEHIND)}
+    start = None if settings.is_published else torch.eye(3).repeat(count, 1, 1)
+    field = JointField(settings, count, channels, start)
+    field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
+    behind = SplinePicture.from_arrays(kept, device) if kept else None
+    return Representation(field.to(device), (height, width), drawn=drawn, behind=behind)

@@ -1,0 +1,209 @@
+"""Motion fields g: where in the scene each pixel of each frame looks. All start at the identity."""
+
+from abc import ABC, abstractmethod
+from typing import assert_never
+
+import numpy as np
+import torch
+from torch import Generator, Tensor, nn
+
+from napari_fiberburst import settings
+from napari_fiberburst.homography import apply, relative_to_first
+from napari_fiberburst.motion.models import DEGREES_OF_FREEDOM, generators
+from napari_fiberburst.networks.layers import make_mlp, make_siren, zero_output
+
+# A flow field is inverted to 1e-4 of half a frame: about 0.03 px of 600.
+_INVERSION_STEPS = 30
+_INVERSION_TOLERANCE = 1e-4
+
+
+class MotionField(nn.Module, ABC):
+    """Map points of a frame into the scene, both in unit coordinates of frame 0.
+
+    Parameters
+    ----------
+    frames : int
+        Length of the burst; its times are spread over [-1, 1].
+
+    Attributes
+    ----------
+    scene_dimensions : int
+        Coordinates that the scene is a function of: 2 for (x, y), 3 for (x, y, t).
+    """
+
+    scene_dimensions = 2
+    times: Tensor
+
+    def __init__(self, frames: int) -> None:
+        super().__init__()
+        self.register_buffer("times", torch.linspace(-1, 1, frames))
+
+    @abstractmethod
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return scene points (N, scene_dimensions) for `points` (N, 2) of the frames numbered `frames` (N,)."""
+
+    def scene_from_frame(self) -> Tensor:
+        """Return homographies (T, 3, 3) in unit coordinates; the identity for motions that have none."""
+        return torch.eye(3, device=self.times.device).expand(len(self.times), 3, 3)
+
+    def roughness(self, points: Tensor, frames: Tensor) -> Tensor | None:
+        """Return what a prior on the motion adds to the loss, or None where there is no prior."""
+        return None
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return where frame 0 shows what each point (N, 2) of its frame shows; NaN where that is nowhere.
+
+        Frame 0's own map is inverted by fixed-point iteration, which converges where that map bends by less
+        than its argument moves.
+        """
+        seen = self(points, frames)
+        first = torch.zeros_like(frames)
+        found = seen
+        for _ in range(_INVERSION_STEPS):
+            missed = seen - self(found, first)
+            found = found + missed
+        return torch.where(missed.abs().amax(dim=1, keepdim=True) < _INVERSION_TOLERANCE, found, torch.nan)
+
+
+class StillField(MotionField):
+    """No motion, T(x, y, t) = (x, y, t): the scene memorises space and time."""
+
+    scene_dimensions = 3
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 3): the points, and the time of each one's frame."""
+        return torch.cat([points, self.times[frames, None]], dim=1)
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return the points themselves."""
+        return points
+
+
+class HomographyField(MotionField):
+    """M_t = g(t), 3x3 with bottom right element 1, from a ReLU network of time."""
+
+    def __init__(self, frames: int, choice: settings.HomographyNetwork, generator: Generator) -> None:
+        super().__init__(frames)
+        self.network = make_mlp([1, *[choice.motion_width] * choice.motion_layers, 8], generator)
+        zero_output(self.network)
+
+    def scene_from_frame(self) -> Tensor:
+        """Return M_t for every frame, (T, 3, 3)."""
+        change = nn.functional.pad(self.network(self.times[:, None]), (0, 1))
+        return torch.eye(3, device=change.device) + change.view(-1, 3, 3)
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): M_t applied to each point. The network runs once a frame, not once a point."""
+        # A look-up by embedding: its gradient sums in one order, where that of indexing is left to races of threads.
+        matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
+        return apply(matrices, points)
+
+    def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return inv(M_0) M_t applied to each point."""
+        scene_from_frame = self.scene_from_frame().detach().cpu().numpy().astype(np.float64)
+        frame0_from_frame = torch.from_numpy(relative_to_first(scene_from_frame)).to(points)
+        return apply(frame0_from_frame[frames], points)
+
+
+class AlignedField(MotionField):
+    """One transform per frame, from where a registration has put it along the generators of its model.
+
+    Parameters
+    ----------
+    start : Tensor
+        (T, 3, 3) homographies in unit coordinates.
+    freedom : int
+        How many generators move: 2 for shifts to 8 for homographies; 0 for none.
+    """
+
+    start: Tensor
+
+    def __init__(self, start: Tensor, freedom: int) -> None:
+        super().__init__(len(start))
+        self.register_buffer("start", start.clone())
+        self.register_buffer("generators", generators(freedom).to(start.dtype), persistent=False)
+        self.steps = nn.Parameter(torch.zeros(len(start), freedom))
+
+    def scene_from_frame(self) -> Tensor:
+        """Return exp(steps) start for every frame, (T, 3, 3)."""
+        change = torch.linalg.matrix_exp(torch.einsum("tk,kij->tij", self.steps, self.get_buffer("generators")))
+        scene_from_frame: Tensor = change @ self.start
+        return scene_from_frame
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): each point, transformed as its frame is."""
+        matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
+        return apply(matrices, points)
+
+
+class FlowField(MotionField):
+    """(x + dx, y + dy) with (dx, dy) = g(x, y, t), a sine network; (x, y) is first put where a registration says."""
+
+    start: Tensor | None
+
+    def __init__(
+        self,
+        frames: int,
+        choice: settings.Flow | settings.FlowTV,
+        generator: Generator,
+        start: Tensor | None = None,
+    ) -> None:
+        super().__init__(frames)
+        self.register_buffer("start", start)
+        widths = [3, *[choice.motion_width] * choice.motion_layers, 2]
+        self.network = make_siren(widths, choice.flow_omega_0, generator)
+        zero_output(self.network)
+        self.tv_weight = choice.tv_weight if isinstance(choice, settings.FlowTV) else 0.0
+
+    def forward(self, points: Tensor, frames: Tensor) -> Tensor:
+        """Return (N, 2): each point plus its displacement."""
+        displacement: Tensor = self.network(self._places(points, frames))
+        return displacement + (points if self.start is None else apply(self.start[frames], points))
+
+    def scene_from_frame(self) -> Tensor:
+        """Return where a registration has put the frames, (T, 3, 3); the identity without one."""
+        return super().scene_from_frame() if self.start is None else self.start
+
+    def roughness(self, points: Tensor, frames: Tensor) -> Tensor | None:
+        """Return the weighted mean absolute Jacobian of g over x, y and t."""
+        if not self.tv_weight:
+            return None
+        places = self._places(points, frames).requires_grad_()
+        displacement = self.network(places)
+        rows = [torch.autograd.grad(displacement[:, axis].sum(), places, create_graph=True)[0] for axis in range(2)]
+        return self.tv_weight * torch.stack(rows).abs().mean()
+
+    def _places(self, points: Tensor, frames: Tensor) -> Tensor:
+        return torch.cat([points, self.times[frames, None]], dim=1)
+
+
+def make_motion(choice: settings.Motion, frames: int, generator: Generator, start: Tensor | None = None) -> MotionField:
+    """Build the motion field that the settings ask for.
+
+    Parameters
+    ----------
+    choice : Motion
+        Which one.
+    frames : int
+        Length of the burst.
+    generator : torch.Generator
+        Source of all random numbers, on the CPU.
+    start : Tensor, optional
+        (T, 3, 3) homographies in unit coordinates, where a registration has put the frames. Without, all start at the
+        identity.
+    """
+    match choice:
+        case settings.Flow() | settings.FlowTV():
+            return FlowField(frames, choice, generator, start)
+        case settings.HomographyNetwork():
+            return HomographyField(frames, choice, generator)
+        case settings.NoMotion() if start is None:
+            return StillField(frames)
+        case settings.NoMotion() | settings.Translation() | settings.Similarity() | settings.Affine():
+            pass
+        case settings.Homography():
+            pass
+        case _:
+            assert_never(choice)
+    start = torch.eye(3).repeat(frames, 1, 1) if start is None else start
+    return AlignedField(start, DEGREES_OF_FREEDOM.get(choice.name, 0))

@@ -1,0 +1,1 @@
+"""Linear operators on pictures and samples, each with its adjoint."""

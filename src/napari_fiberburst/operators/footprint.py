@@ -1,0 +1,67 @@
+"""The area over which a core gathers light, as a filter of the scene."""
+
+import math
+
+import torch
+from scipy.fft import next_fast_len
+from torch import Tensor
+
+from napari_fiberburst.operators.grid import Grid
+
+# The rim of the disc is this soft, pixels, and drawn with this many points a node.
+_EDGE = 0.3
+_SUBSAMPLES = 5
+
+
+class Footprint:
+    """Filter pictures on a grid by a disc: each node becomes the mean of the scene about it.
+
+    Cores are round and the scene's scale hardly differs between frames, so one filter of the scene stands for all
+    footprints, and a core is one point in the filtered scene. The filter is symmetric, so it is its own adjoint.
+
+    Parameters
+    ----------
+    grid : Grid
+        Where the pictures live; outside, they are 0.
+    radius : float
+        Of the disc, pixels.
+    """
+
+    def __init__(self, grid: Grid, radius: float) -> None:
+        kernel = disc(radius / grid.spacing, _EDGE / grid.spacing)
+        reach = kernel.shape[0] // 2
+        self._shape = grid.shape
+        self._padded = tuple(int(next_fast_len(side + reach, real=True)) for side in grid.shape)
+        centred = torch.zeros(self._padded)
+        centred[: kernel.shape[0], : kernel.shape[1]] = kernel
+        centred = torch.roll(centred, (-reach, -reach), (0, 1))
+        self._response = torch.fft.rfft2(centred).real
+        self._kernel = kernel
+        self.power = float(kernel.square().sum())
+
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """Return the filtered pictures, (..., H, W)."""
+        if self._response.device != pictures.device:
+            self._response = self._response.to(pictures.device)
+        spectrum = torch.fft.rfft2(pictures, s=self._padded) * self._response
+        filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
+        return filtered
+
+    def transfer(self, along_y: Tensor, along_x: Tensor) -> Tensor:
+        """Return the filter's response at frequencies (Fy,) by (Fx,), cycles per node: (Fy, Fx)."""
+        reach = self._kernel.shape[0] // 2
+        offsets = torch.arange(-reach, reach + 1).to(along_y)
+        by_y, by_x = (torch.cos(2 * math.pi * along[:, None] * offsets) for along in (along_y, along_x))
+        response: Tensor = by_y @ self._kernel.to(along_y) @ by_x.T
+        return response
+
+
+def disc(radius: float, edge: float) -> Tensor:
+    """Return a disc with soft edges as an odd square kernel that sums to 1; radius and edge in nodes."""
+    reach = max(1, math.ceil(radius + 3 * edge))
+    fine = (torch.arange((2 * reach + 1) * _SUBSAMPLES) + 0.5) / _SUBSAMPLES - reach - 0.5
+    distance = torch.hypot(fine[:, None], fine[None, :])
+    inside = torch.special.erfc((distance - radius) / (math.sqrt(2) * edge)) / 2
+    kernel = inside.reshape(2 * reach + 1, _SUBSAMPLES, 2 * reach + 1, _SUBSAMPLES).mean(dim=(1, 3))
+    even: Tensor = kernel / kernel.sum()
+    return even

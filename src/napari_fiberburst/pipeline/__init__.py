@@ -1,0 +1,1 @@
+"""The pipeline: the steps of the method strung together, reported while they happen."""

@@ -1,0 +1,190 @@
+"""One fit in the making: the joint field, the samples it is fitted to, and Adam."""
+
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from napari_fiberburst.coordinates import unit_from_pixel
+from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.networks.batches import Batch, Samples
+from napari_fiberburst.networks.field import JointField
+from napari_fiberburst.networks.image import Representation
+from napari_fiberburst.networks.motion import AlignedField
+from napari_fiberburst.networks.scene import PUBLISHED_SIGMA
+from napari_fiberburst.pipeline.alignment import Alignment
+from napari_fiberburst.pipeline.observed import ObservedSamples
+from napari_fiberburst.results.reconstruction import Reconstruction
+from napari_fiberburst.settings import Hash, Settings
+
+# As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
+BATCHES_PER_FRAME = 8
+BETAS = (0.9, 0.999)
+_PUBLISHED_RATE = 1e-4
+# Behind a bundle model, and started from a registration, larger steps are safe. Grids learn each place by itself.
+_OBSERVED_RATE, _OBSERVED_RATE_OF_GRIDS = 1e-3, 1e-2
+# Motion that is right to a part of a pixel takes this part of the scene's step size.
+_PACE_OF_REGISTERED_MOTION = 0.01
+
+# What two bursts must share to be taken for one.
+_IDENTITY = ("shape", "axes", "dtype", "black_level", "white_level", "origin")
+# Of the field, of Adam, and how many samples were drawn.
+State = tuple[dict[str, Any], dict[str, Any], int]
+
+
+class Problem:
+    """Minimise the mean of |I_hat - I|^2 over the samples, plus the motion's prior where it has one.
+
+    Parameters
+    ----------
+    burst : Burst
+        What to explain.
+    settings : Settings
+        How.
+    device : torch.device
+        Where.
+    initial : Reconstruction, optional
+        Where to go on from; the samples go on from where its run ended, too.
+    aligned : Alignment, optional
+        The burst, calibrated and registered; without, its frames are fitted as they are, as published.
+
+    Raises
+    ------
+    SettingsError
+        `initial` stands for another burst or was made with other networks.
+    """
+
+    # Whatever the caller's thread has set, the fit needs gradients, and tensors that can have them.
+    @torch.inference_mode(False)
+    def __init__(
+        self,
+        burst: Burst,
+        settings: Settings,
+        device: torch.device,
+        initial: Reconstruction | None = None,
+        aligned: Alignment | None = None,
+    ) -> None:
+        count, height, width, channels = burst.shape
+        self.frame_shape = (height, width)
+        self.samples: Samples | ObservedSamples
+        start = None
+        if aligned is None:
+            self.samples = Samples(burst, device, settings.seed)
+            self.batch = settings.batch or -(-height * width // BATCHES_PER_FRAME)
+        else:
+            self.samples = ObservedSamples(aligned, settings.held_out, settings.seed)
+            self.batch = min(settings.batch or -(-height * width // BATCHES_PER_FRAME), self.samples.count)
+            start = _unit_start(aligned)
+        self.field = JointField(settings, count, channels, start).to(device)
+        self.learning_rate = settings.learning_rate or _usual_rate(settings)
+        registered = isinstance(self.field.motion, AlignedField)
+        self._paces = (1.0, _PACE_OF_REGISTERED_MOTION if registered else 1.0)
+        parts = [{"params": part.parameters()} for part in (self.field.scene, self.field.motion)]
+        self.optimizer = torch.optim.Adam(parts, lr=self.learning_rate, betas=BETAS)
+        self.set_learning_rate(self.learning_rate)
+        if initial is not None:
+            self._go_on_from(initial, burst, settings)
+
+    @torch.inference_mode(False)
+    def step(self) -> Tensor:
+        """Take one step of Adam on a fresh batch; return the loss before it, still on the device."""
+        batch = self.samples.draw(self.batch)
+        with torch.enable_grad():
+            loss = self._misfit(batch)
+            points = batch.points if batch.points.ndim == 2 else batch.points[:, 0]
+            roughness = self.field.motion.roughness(points, batch.frames)
+            if roughness is not None:
+                loss = loss + roughness
+            self.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+        self.optimizer.step()
+        return loss.detach()
+
+    def sample_error(self) -> float | None:
+        """Return the root mean square error, intensities in [0, 1], of samples that were left out; None without any."""
+        left_out = self.samples.left_out() if isinstance(self.samples, ObservedSamples) else None
+        if left_out is None:
+            return None
+        with torch.no_grad():
+            error: float = float(self._misfit(left_out)) ** 0.5 / 2
+        return error
+
+    def _misfit(self, batch: Batch) -> Tensor:
+        """Return the mean squared difference of the field and a batch."""
+        if batch.points.ndim == 2:
+            predicted = self.field(batch.points, batch.frames)
+        else:
+            count, each, _ = batch.points.shape
+            seen = self.field(batch.points.reshape(-1, 2), batch.frames.repeat_interleave(each))
+            predicted = seen.reshape(count, each, -1).mean(dim=1)
+        square = (predicted - batch.intensities).square()
+        if batch.weights is None:
+            mean: Tensor = square.mean()
+            return mean
+        weighted: Tensor = (square.mean(dim=1) * batch.weights).sum() / batch.weights.sum()
+        return weighted
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """Change Adam's step size."""
+        for group, pace in zip(self.optimizer.param_groups, self._paces, strict=True):
+            group["lr"] = pace * learning_rate
+
+    def is_finite(self) -> bool:
+        """Whether every parameter is a number. Waits for the device."""
+        sums = torch.stack([parameter.detach().sum() for parameter in self.field.parameters()])
+        return bool(torch.isfinite(sums).all())
+
+    @torch.inference_mode(False)
+    def state(self) -> State:
+        """Return a copy of all that a step changes."""
+        return deepcopy((self.field.state_dict(), self.optimizer.state_dict(), self.samples.drawn))
+
+    @torch.inference_mode(False)
+    def restore(self, state: State) -> None:
+        """Return to a state."""
+        field, optimizer, drawn = state
+        self.field.load_state_dict(field)
+        self.optimizer.load_state_dict(optimizer)
+        self.samples.drawn = drawn
+
+    def representation(self) -> Representation:
+        """Return the state as it is now, to draw or to go on from."""
+        state: dict[str, Any] = self.optimizer.state_dict()
+        return Representation(self.field, self.frame_shape, state, self.samples.drawn)
+
+    def _go_on_from(self, initial: Reconstruction, burst: Burst, settings: Settings) -> None:
+        start = initial.renderer
+        here, there = ({name: getattr(of, name) for name in _IDENTITY} for of in (burst, initial.acquisition))
+        if not isinstance(start, Representation) or here != there:
+            raise SettingsError(f"initial must be a reconstruction of this burst, {here}; it was made from {there}")
+        try:
+            self.field.load_state_dict(start.field.state_dict())
+        except RuntimeError as error:
+            raise SettingsError(
+                f"initial was made with motion {initial.settings.motion} and encoding {initial.settings.encoding}; "
+                f"continue with networks of the same kind and size, not {settings.motion} and {settings.encoding}"
+            ) from error
+        if start.optimizer_state is not None:
+            self.optimizer.load_state_dict(deepcopy(start.optimizer_state))
+            self.set_learning_rate(self.learning_rate)
+        if self.field.scene.has_sigma:
+            sigma = getattr(settings.encoding, "sigma", None)
+            self.field.scene.set_sigma(PUBLISHED_SIGMA if sigma is None else sigma)
+        self.samples.drawn = start.drawn
+
+
+def _unit_start(aligned: Alignment) -> Tensor:
+    """Return where registration has put each frame, (T, 3, 3) in unit coordinates; the identity for unused frames."""
+    to_unit = unit_from_pixel(aligned.shape)
+    matrices = np.nan_to_num(aligned.homographies())
+    matrices[~aligned.used] = np.eye(3)
+    return torch.from_numpy((to_unit @ matrices @ np.linalg.inv(to_unit)).astype(np.float32))
+
+
+def _usual_rate(settings: Settings) -> float:
+    if settings.is_published:
+        return _PUBLISHED_RATE
+    return _OBSERVED_RATE_OF_GRIDS if isinstance(settings.encoding, Hash) else _OBSERVED_RATE

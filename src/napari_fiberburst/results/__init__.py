@@ -1,0 +1,1 @@
+"""What comes out: reconstructions, what they rest on, and the reports on the way there."""

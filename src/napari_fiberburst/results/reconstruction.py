@@ -1,0 +1,294 @@
+"""Reconstruction: the picture a burst gave, how its frames lie on it, and where it all came from."""
+
+from dataclasses import dataclass, field
+from operator import index
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.io.results import is_representation, write_picture, write_representation
+from napari_fiberburst.results.diagnostics import Evidence
+from napari_fiberburst.settings import Settings
+
+_BAND_PIXELS = 2**17
+_NOTHING = np.array(None, dtype=object)
+_MOST_PIXELS = 2**31
+
+Ending = Literal["finished", "stopped", "time budget", "diverged"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Canvas:
+    """Where a picture lies in frame-0 pixels.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Height and width of the picture.
+    frame0_from_image : numpy.ndarray
+        3x3: picture pixel (x, y) to frame-0 pixel; integers are pixel centres in both.
+    """
+
+    shape: tuple[int, int]
+    frame0_from_image: NDArray[np.float64]
+
+    @classmethod
+    def over(cls, bounds: tuple[float, float, float, float], scale: float = 1.0) -> "Canvas":
+        """Cover the frame-0 columns x0 to x1 and rows y0 to y1, `scale` picture pixels to a frame pixel.
+
+        Parameters
+        ----------
+        bounds : (float, float, float, float)
+            x0, y0, x1, y1, half-open as in slicing: (0, 0, W, H) is frame 0's field; it may reach beyond.
+        scale : float
+            2 doubles the pixels on each axis. Where a side times scale is no whole number, the picture has the
+            nearest whole number of pixels and covers the bounds all the same.
+
+        Raises
+        ------
+        SettingsError
+            The bounds are empty or the scale is not positive.
+        """
+        edges = np.array(bounds)
+        if edges.shape != (4,) or edges.dtype.kind not in "iuf" or not np.isfinite(edges).all():
+            raise SettingsError(f"bounds must be four numbers x0, y0, x1, y1; got {bounds}")
+        x0, y0, x1, y1 = edges.astype(np.float64).tolist()
+        if not (x0 < x1 and y0 < y1):
+            raise SettingsError(f"bounds must be x0, y0, x1, y1 with x0 < x1 and y0 < y1; got {bounds}")
+        if isinstance(scale, str) or not 0 < scale < np.inf:
+            raise SettingsError(f"scale must be a number above 0; got {scale!r}")
+        width, height = (max(1, round((stop - start) * scale)) for start, stop in ((x0, x1), (y0, y1)))
+        if width * height > _MOST_PIXELS:
+            raise SettingsError(
+                f"a picture of {height} x {width} pixels must be drawn in parts; got bounds {bounds} at scale {scale:g}"
+            )
+        step_x, step_y = (x1 - x0) / width, (y1 - y0) / height
+        # Pixel edges meet the bounds, so the first centre lies half a step inside them.
+        first_x, first_y = x0 - 0.5 + step_x / 2, y0 - 0.5 + step_y / 2
+        matrix = np.array([[step_x, 0, first_x], [0, step_y, first_y], [0, 0, 1]], dtype=np.float64)
+        return cls(shape=(height, width), frame0_from_image=matrix)
+
+    def points(self, first: int = 0, last: int | None = None) -> NDArray[np.float64]:
+        """Return the frame-0 point (x, y) of every pixel of rows `first` up to `last`, (rows, W, 2)."""
+        height, width = self.shape
+        columns, rows = np.meshgrid(np.arange(width), np.arange(height)[first:last])
+        mapped = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ self.frame0_from_image.T
+        points: NDArray[np.float64] = mapped[..., :2] / mapped[..., 2:]
+        return points
+
+
+def draw(renderer: "Renderer", canvas: Canvas, frame: int, acquisition: Acquisition) -> NDArray[np.float32]:
+    """Draw the scene as `frame` sees it, on a canvas in that frame's pixels, in the recording's intensity units.
+
+    Rows are drawn some at a time, so that what is in memory beside the picture does not grow with it.
+    """
+    height, width = canvas.shape
+    band = max(1, _BAND_PIXELS // width)
+    picture = np.empty((height, width, acquisition.shape[3]), np.float32)
+    for first in range(0, height, band):
+        picture[first : first + band] = renderer.render(canvas.points(first, first + band), frame)
+    return acquisition.in_original_units(picture)
+
+
+class Renderer(Protocol):
+    """What a solver hands over to make pictures of the scene it has fitted."""
+
+    def render(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
+        """Return the scene as `frame` sees it, (H, W, C) in [0, 1], at that frame's pixels `points` (H, W, 2)."""
+
+    def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+        """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the fitted parameters by name."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reconstruction(Evidence):
+    """A clean picture of the scene, the motion of the burst, and how they were made.
+
+    Attributes
+    ----------
+    image : numpy.ndarray
+        (H, W) or (H, W, C) float32 in the burst's original intensity units, on the canvas. Not clipped.
+    canvas : Canvas
+        Where the image lies in frame-0 pixels; frame 0's field at scale 1.
+    homographies : numpy.ndarray
+        (T, 3, 3) float64, frame-t pixel (x, y) to frame-0 pixel; [0] is the identity. All are identities for
+        motion none and for optical flow (see `flow`).
+    losses : numpy.ndarray
+        (steps,) float32, each step's mean squared error with intensities in [-1, 1], plus the motion's prior; the
+        steps of the run it continued are in front.
+    settings : Settings
+        What it was made with.
+    seconds : float
+        Time from the first step on, pauses left out, the run it continued included.
+    parameters : int
+        Numbers that were fitted.
+    compression : float
+        1 - bytes of the parameters as float32 / bytes of the burst as it came.
+    device : str
+        Where it was computed.
+    ending : str
+        Why the run ended: "finished", "stopped", "time budget", or "diverged", where the loss turned NaN and this
+        is the last good state.
+    acquisition : Acquisition
+        What is known of the burst.
+
+    Notes
+    -----
+    What the picture rests on (`coverage`, `uncertainty`, `sample_error`, `cores` and more) is described at
+    `napari_fiberburst.results.diagnostics.Evidence`. "Frame 0" stands for the frame `reference` wherever that is
+    another.
+    """
+
+    image: NDArray[np.float32]
+    canvas: Canvas
+    homographies: NDArray[np.float64]
+    losses: NDArray[np.float32]
+    settings: Settings
+    seconds: float
+    parameters: int
+    device: str
+    ending: Ending
+    acquisition: Acquisition
+    renderer: Renderer = field(repr=False)
+
+    @property
+    def compression(self) -> float:
+        """1 - bytes of the parameters as float32 / bytes of the burst as it came; below 0 it takes more room."""
+        return 1 - 4 * self.parameters / self.acquisition.nbytes
+
+    def render(
+        self, scale: float = 1.0, bounds: tuple[float, float, float, float] | None = None
+    ) -> NDArray[np.float32]:
+        """Draw the scene as frame 0 sees it.
+
+        Parameters
+        ----------
+        scale : float
+            Picture pixels to a frame-0 pixel; 2 doubles both sides.
+        bounds : (float, float, float, float), optional
+            x0, y0, x1, y1 in frame-0 pixels, half-open; default frame 0's field. They may reach beyond it, where
+            only other frames have looked, or none. Behind a calibrated bundle what no core has looked at is NaN; a
+            network fitted as published marks nothing.
+
+        Returns
+        -------
+        numpy.ndarray
+            (H, W) or (H, W, C) float32 in the burst's intensity units, on ``Canvas.over(bounds, scale)``.
+
+        Raises
+        ------
+        SettingsError
+            The bounds are empty or the scale is not positive.
+        """
+        canvas = Canvas.over(self._field if bounds is None else bounds, scale)
+        return draw(self.renderer, canvas, self.reference, self.acquisition)
+
+    def frame(self, t: int, scale: float = 1.0) -> NDArray[np.float32]:
+        """Draw the clean scene as frame t sees it, I_hat(x, y, t) = f(gamma(T_g(x, y, t))).
+
+        Parameters
+        ----------
+        t : int
+            Frame number; negative ones count from the end.
+        scale : float
+            Picture pixels to a frame pixel.
+
+        Returns
+        -------
+        numpy.ndarray
+            (H, W) or (H, W, C) float32 in the burst's intensity units. Behind a calibrated bundle, NaN beyond the
+            canvas and a margin about it, and for frames that were left out.
+
+        Raises
+        ------
+        IndexError
+            There is no such frame.
+        SettingsError
+            The scale is not positive.
+        """
+        return draw(self.renderer, Canvas.over(self._field, scale), self._number(t), self.acquisition)
+
+    def flow(self, t: int) -> NDArray[np.float64]:
+        """Return how far frame t's pixels are from where frame 0 shows the same point of the object.
+
+        Parameters
+        ----------
+        t : int
+            Frame number; negative ones count from the end.
+
+        Returns
+        -------
+        numpy.ndarray
+            (H, W, 2) as (x, y) in pixels: frame-t pixel + flow = frame-0 pixel, whatever the motion's model; 0 for
+            motion none. NaN where frame 0 shows the point nowhere, because its own flow folds.
+
+        Raises
+        ------
+        IndexError
+            There is no such frame.
+        """
+        return self.renderer.displacement(Canvas.over(self._field).points(), self._number(t))
+
+    def provenance(self) -> dict[str, Any]:
+        """Return where the picture came from, as plain values that JSON can hold; None stands for NaN."""
+        return {
+            "settings": self.settings.to_dict(),
+            "seed": self.settings.seed,
+            "device": self.device,
+            "ending": self.ending,
+            "seconds": self.seconds,
+            "parameters": self.parameters,
+            "compression": self.compression,
+            "canvas": {
+                "shape": self.canvas.shape,
+                "frame0_from_image": self.canvas.frame0_from_image.tolist(),
+            },
+            "burst": self.acquisition.to_dict(),
+            "homographies": np.where(
+                np.isfinite(self.homographies), self.homographies.astype(object), _NOTHING
+            ).tolist(),
+            "losses": [float(loss) if np.isfinite(loss) else None for loss in self.losses],
+            **self.summary(),
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write the picture, or the fitted networks themselves.
+
+        Parameters
+        ----------
+        path : str or Path
+            ``.ome.tif`` (or ``.tif``): the image as OME-TIFF with pixel size and channel names, and its
+            provenance as JSON beside it. ``.npz``: the compressed representation, which
+            `napari_fiberburst.load` reads back to be rendered at any size or continued (without Adam's moments).
+
+        Returns
+        -------
+        Path
+            The file written.
+
+        Raises
+        ------
+        OutputError
+            The folder does not exist or cannot be written, or the ending is not one of these. Files are replaced
+            whole: a killed run leaves the old one or the new one, never half of one.
+        """
+        if is_representation(Path(path)):
+            return write_representation(path, self.renderer.arrays(), self.provenance())
+        return write_picture(path, self.image, self.acquisition, self.provenance())
+
+    @property
+    def _field(self) -> tuple[float, float, float, float]:
+        return 0, 0, self.acquisition.shape[2], self.acquisition.shape[1]
+
+    def _number(self, t: int) -> int:
+        count, t = len(self.homographies), index(t)
+        if not -count <= t < count:
+            raise IndexError(f"frame {t} of a burst of {count}")
+        return t % count

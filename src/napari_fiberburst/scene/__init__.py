@@ -1,0 +1,1 @@
+"""Step 4: the scene as a linear spline, solved for."""

@@ -1,0 +1,156 @@
+"""How smooth the scene should be, chosen by what one part of the burst tells of another."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.bundle.samples import Observation
+from napari_fiberburst.operators.grid import Grid, blur
+from napari_fiberburst.quality.resolution import ring_correlation
+from napari_fiberburst.scene.spline import Normal
+
+# Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
+_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
+_STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
+# A picture this rough has hardly any bias left: it stands for the truth that the other half's pictures are held to.
+_REFERENCE = 0.01
+# The smoothness where it cannot be told.
+UNTOLD = 0.1
+# Smoothness is chosen in a window of at most this many nodes a side.
+_WINDOW = 224
+# Every core is left out once, with so many others that most of its neighbours stay.
+_FOLDS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothness:
+    """How smooth the scene should be, and what resolution that gives.
+
+    Attributes
+    ----------
+    weight : float
+        lambda.
+    resolution : float or None
+        Pixels, the finest period on which two halves of the burst agree; None where that could not be told.
+    """
+
+    weight: float
+    resolution: float | None
+
+
+def choose_smoothness(
+    observation: Observation, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
+) -> Smoothness:
+    """Choose the smoothness by which each half of the burst best predicts the scene of the other.
+
+    Even and odd frames are solved apart. The squared difference between the scene from one half, at each smoothness,
+    and a nearly unbiased scene from the other is that scene's error plus a constant, for the halves' noise is
+    independent. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that matter.
+
+    Parameters
+    ----------
+    observation, points
+        What is seen, and where (T, N, 2).
+    frames : numpy.ndarray
+        Numbers of the frames that take part, at least two.
+    grid : Grid
+        Of the scene.
+    scene : Tensor
+        (H, W), a first scene on that grid: the window is laid where it has most structure.
+    """
+    window = _window(grid, scene)
+    grey = observation.values.mean(dim=2, keepdim=True)
+    halves = []
+    for chosen in (frames[::2], frames[1::2]):
+        normal = Normal(window, observation.radius, 1, points.device)
+        for number in chosen:
+            normal.add(points[number], grey[number], observation.weights[number])
+        halves.append(normal)
+    densities = [blur(half.density(), 3.0) for half in halves]
+    both = torch.minimum(*densities)
+    seen = (both > 0.2 * both.max()) & (both > 0)
+    if not bool(seen.any()):
+        return Smoothness(UNTOLD, None)
+    paths = [
+        [
+            half.picture(scene, smoothness)
+            for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)
+        ]
+        for half in halves
+    ]
+    reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
+    risks = [
+        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, seen].mean())
+        for first, second in zip(*paths, strict=True)
+    ]
+    weight, nearest = _lowest(np.array(risks), _CANDIDATES)
+    soft = (blur(seen.to(scene), 4.0) * seen).cpu().numpy()
+    first, second = (path[nearest][0].cpu().numpy() for path in paths)
+    resolution = window.spacing * ring_correlation(first, second, soft).resolution
+    return Smoothness(weight, resolution if math.isfinite(resolution) else None)
+
+
+def choose_among_neighbours(
+    observation: Observation, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
+) -> Smoothness:
+    """Choose the smoothness by which each core is best predicted from those around it.
+
+    For a burst that does not move. Its halves share every gap, and what cores differ by: neither half tells which part
+    of the other's picture is object and which is core. Between neighbours, cores differ at random and the object does
+    not, so the smoothness that predicts cores left out (cross-validation in folds) takes out what is the cores'.
+
+    Parameters are those of `choose_smoothness`; one frame is enough.
+    """
+    window = _window(grid, scene)
+    grey = observation.values.mean(dim=2, keepdim=True)
+    fold = torch.randperm(grey.shape[1], generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
+    risks = np.zeros(len(_STILL_CANDIDATES))
+    for left in range(_FOLDS):
+        normal = Normal(window, observation.radius, 1, points.device)
+        for number in frames:
+            normal.add(points[number], grey[number], observation.weights[number] * (fold != left))
+        for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
+            shown = normal.through(guess)[0]
+            for number in frames:
+                asked = (fold == left) & (observation.weights[number] > 0)
+                at = window.at(points[number, asked])
+                weights = observation.weights[number, asked] * at.inside
+                risks[index] += float((weights * (grey[number, asked, 0] - at.read(shown)) ** 2).sum())
+    return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
+
+
+def _path(normal: Normal, candidates: tuple[float, ...]) -> list[Tensor]:
+    """Return the scenes of all candidates, each started from the smoother one before."""
+    scene = normal.mean()
+    scenes = []
+    for smoothness in candidates:
+        scene = normal.solve(smoothness, scene, 40)
+        scenes.append(scene)
+    return scenes
+
+
+def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> tuple[float, int]:
+    """Return the smoothness of least risk, by a parabola through the lowest candidate and its neighbours."""
+    index = int(np.argmin(risks))
+    exponents = np.log10(candidates)
+    if not 0 < index < len(risks) - 1:
+        return candidates[index], index
+    near = slice(index - 1, index + 2)
+    curve = np.polyfit(exponents[near], np.log(risks[near] + 1e-300), 2)
+    lowest = -curve[1] / (2 * curve[0]) if curve[0] > 0 else exponents[index]
+    return float(10 ** np.clip(lowest, exponents[index + 1], exponents[index - 1])), index
+
+
+def _window(grid: Grid, scene: Tensor) -> Grid:
+    """Return the part of a grid, of limited size, in which the scene changes most."""
+    rows, columns = (min(_WINDOW, side) for side in grid.shape)
+    change = torch.zeros_like(scene)
+    change[:-1, :-1] = (scene[1:, :-1] - scene[:-1, :-1]).abs() + (scene[:-1, 1:] - scene[:-1, :-1]).abs()
+    total = torch.nn.functional.pad(change.cumsum(0).cumsum(1), (1, 0, 1, 0))
+    sums = total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
+    row, column = divmod(int(sums.argmax()), sums.shape[1])
+    return Grid(grid.x0 + column * grid.spacing, grid.y0 + row * grid.spacing, grid.spacing, (rows, columns))

@@ -1,0 +1,169 @@
+"""What a user can choose between: how the scene is held, and how the object moves. Standard library only."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, get_args
+
+from napari_fiberburst.settings.parameter import check, knob
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoEncoding:
+    """The coordinates as they are: a smooth picture without fine detail."""
+
+    name: ClassVar[str] = "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NeRF:
+    """Sines and cosines at octaves (Mildenhall et al., 2020)."""
+
+    name: ClassVar[str] = "nerf"
+    highest_octave: int = knob(
+        15, "L of the octaves 2^0 to 2^L; more resolve finer detail, noise and honeycomb.", least=0, most=24
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fourier:
+    """Random Fourier features (Tancik et al., 2020)."""
+
+    name: ClassVar[str] = "fourier"
+    features: int = knob(256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1, most=2**16)
+    sigma: float | None = knob(
+        None,
+        "Frequency spread, cycles per half frame; more resolves finer detail, and noise. None follows the core pitch; "
+        "without a bundle model it is 5, as published, and more resolves the honeycomb in the end.",
+        above=0,
+        most=1e6,
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hash:
+    """Multi-resolution hash grid (Müller et al., 2022)."""
+
+    name: ClassVar[str] = "hash"
+    levels: int = knob(12, "Grid levels; more resolve finer detail.", least=1, most=24)
+    level_features: int = knob(2, "Learned values per grid point; more can hold more, at more cost.", least=1, most=64)
+    table_bits: int = knob(16, "Binary log of the table length; more means fewer collisions.", least=4, most=24)
+    base_resolution: int = knob(4, "Cells across the frame at the coarsest level.", least=1, most=4096)
+    growth: float = knob(1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1, most=2)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Siren:
+    """Sine activations instead of an encoding (Sitzmann et al., 2020)."""
+
+    name: ClassVar[str] = "siren"
+    omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spline:
+    """A linear spline instead of a network, solved rather than trained: the fastest, and here the sharpest."""
+
+    name: ClassVar[str] = "spline"
+    smoothness: float | None = knob(
+        None,
+        "Weight of the smoothness prior; more is smoother and less noisy. None lets two halves of the burst choose.",
+        above=0,
+        most=1e6,
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoMotion:
+    """No motion: the object stands still; without a bundle model, a network memorises f(x, y, t)."""
+
+    name: ClassVar[str] = "none"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Translation:
+    """One shift per frame."""
+
+    name: ClassVar[str] = "translation"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Similarity:
+    """One shift, turn and scale per frame."""
+
+    name: ClassVar[str] = "similarity"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Affine:
+    """One affine transform per frame: shift, turn, scale and shear."""
+
+    name: ClassVar[str] = "affine"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Homography:
+    """One homography per frame: a flat object, seen from anywhere."""
+
+    name: ClassVar[str] = "homography"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _MotionNetwork:
+    motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1, most=64)
+    motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HomographyNetwork(_MotionNetwork):
+    """One 3x3 homography per frame, by a network of time, as published."""
+
+    name: ClassVar[str] = "homography"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flow(_MotionNetwork):
+    """A displacement per pixel and frame, from a sine network: objects that deform."""
+
+    name: ClassVar[str] = "flow"
+    flow_omega_0: float = knob(
+        30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0, most=1e4
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowTV(Flow):
+    """Optical flow with total variation: displacements that change little from pixel to pixel."""
+
+    name: ClassVar[str] = "flow_tv"
+    tv_weight: float = knob(1.0, "Weight of the flow's total variation; more makes it smoother.", least=0)
+
+
+Encoding = Spline | NoEncoding | NeRF | Fourier | Hash | Siren
+Motion = NoMotion | Translation | Similarity | Affine | Homography | HomographyNetwork | Flow | FlowTV
+
+ENCODINGS: Mapping[str, type[Encoding]] = {choice.name: choice for choice in get_args(Encoding)}
+# Behind a bundle model every frame has a transform of its own; as published, a network of time gives them all.
+MOTIONS: Mapping[str, type[Motion]] = {
+    choice.name: choice for choice in get_args(Motion) if choice is not HomographyNetwork
+}
+PUBLISHED_MOTIONS: Mapping[str, type[Motion]] = {
+    choice.name: choice for choice in (NoMotion, HomographyNetwork, Flow, FlowTV)
+}
