@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
-from napari_fiberburst.results.reconstruction import Canvas
+from napari_fiberburst.data.canvas import Canvas
 
 FRAME = (960, 1280)
 BLACK_LEVEL = 3

@@ -15,9 +15,11 @@ import psutil
 
 from benchmarks.results import COST, Results, Row
 from napari_fiberburst import Progress, reconstruct
+from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.reconstruct import iterate
-from napari_fiberburst.pipeline.spline import SelfCalibrated
+from napari_fiberburst.pipeline.stages import Stages
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import simulate
 
@@ -123,15 +125,23 @@ def _stages(side: int, device: str) -> Row:
         spent[name] = spent.get(name, 0.0) + now - last
         last = now
 
-    fit = SelfCalibrated(burst, choose(device=device))
-    lap("calibrate")
-    is_registered = False
-    for stage in fit.align():
-        lap("refine bundle and motion" if is_registered else "register")
-        is_registered = is_registered or stage == "registered"
-    for _ in fit.solve():
+    stages = Stages(burst, choose(device=device), find_device(device), None)
+    fitted, is_registered = None, False
+    steps = stages.align()
+    while True:
+        try:
+            fitted = next(steps)
+        except StopIteration as end:
+            fitted = end.value
+            break
+        lap("calibrate" if fitted is None else "refine bundle and motion" if is_registered else "register")
+        is_registered = is_registered or (fitted is not None and fitted.registration.stage == "complete")
+    lap("refine bundle and motion")
+    for _ in stages.solve(fitted):
         lap("solve the scene, choose its smoothness")
-    fit.result()
+    scene = fitted.scene
+    assert scene is not None
+    diagnose(burst, fitted.bundle, fitted.registration, scene, fitted.canvas)
     lap("coverage, uncertainty, residuals")
     return {"stages": spent}
 

@@ -10,18 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from benchmarks.cases import Case
 from benchmarks.peers import inpainting, unet
 from napari_fiberburst import Progress, Reconstruction, reconstruct
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.samples import sample
+from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError, SettingsError
-from napari_fiberburst.pipeline.spline import SelfCalibrated
+from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.pipeline.stages import Fitted, Stages
 from napari_fiberburst.quality import psnr
+from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import SimulatedBurst
+from napari_fiberburst.steps import drain
 
 Picture = NDArray[np.float32]
 WIDTHS = np.arange(0.5, 8.1, 0.25)
@@ -128,10 +134,8 @@ def gaussian_fixed(case: Case, simulated: SimulatedBurst, effort: Effort) -> Out
 def registered_mean(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return the mean of the frames, each moved onto frame 0 by our registration; no bundle model beyond that."""
     start = time.perf_counter()
-    fit = SelfCalibrated(simulated.burst, choose(device=effort.device))
-    for _ in fit.align():
-        pass
-    homographies = fit.alignment.homographies()
+    fitted = drain(Stages(simulated.burst, choose(), find_device(effort.device), None).align())
+    homographies = fitted.registration.reference_from_frame
     picture = mean_over(simulated.burst.frames, homographies)
     return Outcome(picture=picture, seconds=time.perf_counter() - start, homographies=homographies)
 
@@ -176,13 +180,19 @@ def default(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
 def oracle(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return what our solver makes of the burst when it is told the true motion and transmission."""
     start = time.perf_counter()
-    image = torch.from_numpy(simulated.transmission).float()[..., None].repeat(1, 1, simulated.burst.shape[3])
-    fit = SelfCalibrated(simulated.burst, choose(fill=True, device=effort.device), image)
-    fit.alignment.take(simulated.homographies, "pixels" if case.physics == "mask" else "cores")
-    for _ in fit.solve():
-        pass
-    result = fit.result()
-    return _outcome(simulated, result, time.perf_counter() - start, [])
+    settings = choose(fill=True, device=effort.device)
+    burst, bundle = simulated.burst, Bundle.from_image(simulated.transmission)
+    samples = sample(burst, bundle, "pixels" if case.physics == "mask" else "cores", device=effort.device)
+    known = Registration.known(simulated.homographies, samples.cores)
+    canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]))
+    told = Fitted(bundle=bundle, registration=known, canvas=canvas, samples=samples)
+    found = drain(Stages(burst, settings, find_device(effort.device), bundle).solve(told))
+    assert found.image is not None
+    return Outcome(
+        picture=_in_full_scale(simulated, draw(found.image, canvas, 0, burst)),
+        seconds=time.perf_counter() - start,
+        homographies=simulated.homographies,
+    )
 
 
 METHODS: Mapping[str, Method] = {

@@ -20,8 +20,8 @@ from benchmarks.chart import BLACK_LEVEL, Shown, finest
 from benchmarks.methods import FIXED_WIDTH, PeerError, fibrebundle
 from benchmarks.results import REAL, Results, Row
 from napari_fiberburst import Burst, read_burst, reconstruct
+from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.results.reconstruction import Canvas
 
 LEFT_OUT = (3, 6, 10)
 # Distance of its cores, pixels; the square that holds the bundle; the part with the chart (x0, y0, x1, y1).

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 
 from napari_fiberburst.networks.field import JointField
-from napari_fiberburst.pipeline.problem import BETAS, Problem
+from napari_fiberburst.networks.training import BETAS, Problem
 from napari_fiberburst.pipeline.reconstruct import iterate
 from napari_fiberburst.settings import choose
 from napari_fiberburst.simulation import simulate
@@ -48,7 +48,7 @@ def main() -> None:
     settings = choose("paper", device="cpu", iterations=(PAIRS + 1) * STEPS)
     burst = simulate("histology", shape=SHAPE, seed=0).burst
     problem = Problem(burst, settings, torch.device("cpu"))
-    step = bare(JointField(settings, burst.shape[0], burst.shape[3]), problem)
+    step = bare(JointField(settings, burst.shape), problem)
     # Every step reports here, which is more often than a run would.
     run = iterate(burst, settings)
     ratios, times = [], []

@@ -21,8 +21,8 @@ result = reconstruct(simulated.burst, fill=True)
 
 captured, truth = simulated.burst.frames[0], simulated.truth[0]
 print(f"{result.ending} in {result.seconds:.1f} s; notes: {result.notes}")
-if result.cores is not None:
-    print(f"{len(result.cores.centres)} cores, {result.cores.pitch:.2f} px apart")
+if result.bundle is not None and result.bundle.is_resolved:
+    print(f"{len(result.bundle.centres)} cores, {result.bundle.pitch:.2f} px apart")
 print(f"captured frame {psnr(captured, truth):.1f} dB, {ssim(captured, truth):.2f}")
 print(f"reconstruction {psnr(result.image, truth):.1f} dB, {ssim(result.image, truth):.2f}")
 print(f"motion off by {motion_error(result.homographies, simulated.homographies, shape):.3f} px")

@@ -10,30 +10,50 @@ if TYPE_CHECKING:
     from napari_fiberburst import quality as quality
     from napari_fiberburst import settings as settings
     from napari_fiberburst import simulation as simulation
+    from napari_fiberburst.bundle.bundle import Bundle as Bundle
+    from napari_fiberburst.bundle.calibrate import calibrate as calibrate
+    from napari_fiberburst.bundle.samples import Samples as Samples
+    from napari_fiberburst.bundle.samples import sample as sample
     from napari_fiberburst.control import Control as Control
     from napari_fiberburst.data.burst import Burst as Burst
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
     from napari_fiberburst.io import read_burst as read_burst
+    from napari_fiberburst.motion.registration import Registration as Registration
+    from napari_fiberburst.motion.registration import register as register
     from napari_fiberburst.networks.image import load as load
+    from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
+    from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
     from napari_fiberburst.results.progress import Progress as Progress
     from napari_fiberburst.results.reconstruction import Reconstruction as Reconstruction
+    from napari_fiberburst.scene.solve import Scene as Scene
+    from napari_fiberburst.scene.solve import solve as solve
     from napari_fiberburst.settings import Settings as Settings
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Bundle": "bundle.bundle",
     "Burst": "data.burst",
     "Control": "control",
+    "Diagnostics": "results.diagnostics",
     "FiberBurstError": "errors",
     "Progress": "results.progress",
     "Reconstruction": "results.reconstruction",
+    "Registration": "motion.registration",
+    "Samples": "bundle.samples",
+    "Scene": "scene.solve",
     "Settings": "settings",
+    "calibrate": "bundle.calibrate",
+    "diagnose": "pipeline.diagnose",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
+    "register": "motion.registration",
+    "sample": "bundle.samples",
+    "solve": "scene.solve",
 }
 
 _MODULES = ("quality", "settings", "simulation")

@@ -9,6 +9,10 @@ class BurstError(FiberBurstError):
     """The frames, or the file they come from, are not a usable burst."""
 
 
+class BundleError(FiberBurstError):
+    """A bundle, or the file or picture it comes from, cannot be used, or does not fit the burst."""
+
+
 class SettingsError(FiberBurstError):
     """A setting is unknown, out of range, or does not apply to the choice made."""
 

@@ -130,10 +130,17 @@ def test_levels_and_crops_that_leave_nothing_to_see_are_refused(rng):
         Burst(frames, black_level=254.5, white_level=1000).crop((0, 20), (0, 50))
 
 
+@pytest.mark.parametrize(
+    ("picture", "axes", "shape"), [((17, 23), None, (1, 17, 23, 1)), ((17, 23, 3), "YXC", (1, 17, 23, 3))]
+)
+def test_one_picture_is_a_burst_of_one_frame(rng, picture, axes, shape):
+    burst = Burst(stack(rng, picture), axes=axes)
+    assert burst.shape == shape
+    assert burst.axes == "TYX" + ("C" if shape[3] > 1 else "")
+
+
 def bad_frames():
     ramp = np.arange(3 * 20 * 20.0).reshape(3, 20, 20)
-    yield "one frame", ramp[:1], "at least 2 frames, got 1"
-    yield "a picture", ramp[0], r"got shape \(20, 20\)"
     yield "a number", 3.0, "frames of one shape"
     yield "ragged", [ramp[0], ramp[1, :-1]], "crop the frames to one size"
     yield "five axes", ramp[:, :, :, None, None], 'axes="CTYX"'
@@ -146,7 +153,7 @@ def bad_frames():
     yield "object", ramp.astype(object), "got object"
     yield "text", np.full((3, 20, 20), "a"), "integers or floats"
     yield "short side", ramp[:, :15], "at least 16 pixels a side, got 15 x 20"
-    yield "nothing", np.zeros((0, 20, 20)), "got 0"
+    yield "nothing", np.zeros((0, 20, 20)), "at least one frame, got none"
 
 
 @pytest.mark.parametrize(("frames", "said"), [pytest.param(*case[1:], id=case[0]) for case in bad_frames()])
@@ -157,7 +164,12 @@ def test_bad_frames_are_refused(frames, said):
 
 def test_bad_axes_are_refused(rng):
     frames = stack(rng, (2, 3, 20, 20))
-    for axes, said in (("TYX", "shape"), ("TTYX", "shape"), ("CZYX", "shape"), ("TZYX", "length 1, got 3")):
+    for axes, said in (
+        ("TYX", "shape"),
+        ("TTYX", "shape"),
+        ("CZYX", "axis Z of TCZYX must have length 1, got 3"),
+        ("TZYX", "length 1, got 3"),
+    ):
         with pytest.raises(BurstError, match=said):
             Burst(frames, axes=axes)
 

@@ -291,7 +291,6 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
     zarr.open_group(str(tmp_path / "plain.zarr"), mode="w")
     np.savez(tmp_path / "axes.npz", frames=frames, axes=np.array(3))
     np.savez(tmp_path / "level.npz", frames=frames, black_level=np.array("dark"))
-    tifffile.imwrite(tmp_path / "single.tif", frames[0])
     for name, said in (
         ("missing.tif", "there is no .*expected a TIFF stack"),
         ("no*.png", "holds no frames"),
@@ -308,7 +307,6 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
         ("axes.npz", "must give its axes as text"),
         ("level.npz", "levels? must be numbers"),
         ("a" * 300 + ".tif", "cannot be opened"),
-        ("single.tif", r"single.tif: a burst is one stack .* got shape \(17, 23\)"),
     ):
         with pytest.raises(BurstError, match=said):
             read_burst(tmp_path / name)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import confidence, find_shifts
 from napari_fiberburst.motion.joint import COARSE, FINER, Groupwise
 from napari_fiberburst.motion.models import FrameMotion
@@ -43,9 +44,9 @@ def look(sensors, homographies):
 
 
 def error(motion, truth):
-    corners = np.array([[0, 0, 1], [139, 0, 1], [0, 119, 1], [139, 119, 1]])
-    found, wanted = (corners @ part.transpose(0, 2, 1) for part in (motion.relative_to(0), truth))
-    return np.abs(found[..., :2] / found[..., 2:] - wanted[..., :2]).max()
+    corners = np.array([[0.0, 0], [139, 0], [0, 119], [139, 119]])
+    found = relative_to(motion.scene_from_frame.numpy(), 0)
+    return np.abs(transform_points(found, corners) - transform_points(truth, corners)).max()
 
 
 def test_shifts_are_found_to_within_a_pitch(sensors):

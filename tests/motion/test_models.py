@@ -1,40 +1,71 @@
-"""Frames move along the generators of their model, and nowhere else."""
+"""Frames move along the generators of their model, and nowhere else: behind splines and behind networks."""
 
 import numpy as np
 import pytest
 import torch
 
-from napari_fiberburst.motion.models import DEGREES_OF_FREEDOM, FrameMotion
+from napari_fiberburst.coordinates import unit_from_pixel
+from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.networks.motion import AlignedField
+from napari_fiberburst.settings import Affine, Homography, Similarity, Translation
+
+MODELS = (Translation, Similarity, Affine, Homography)
+# Odd sides, one three times the other: what a square frame would hide shows.
+SHAPES = ((31, 37), (31, 97), (101, 33))
 
 
-@pytest.mark.parametrize("model", DEGREES_OF_FREEDOM)
+def by_registration(shape, steps):
+    """Return where registration takes frames for steps (T, k) along the generators, (T, 3, 3) in pixels."""
+    motion = FrameMotion(len(steps), shape)
+    motion.move(steps)
+    return motion.scene_from_frame.numpy()
+
+
+def by_network(shape, steps):
+    """Return where the motion of a network takes them."""
+    field = AlignedField(torch.eye(3, dtype=torch.float64).repeat(len(steps), 1, 1), shape, steps.shape[1])
+    field.steps.data = steps
+    to_unit = unit_from_pixel(shape)
+    return np.linalg.inv(to_unit) @ field.scene_from_frame().detach().numpy() @ to_unit
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("moved", [by_registration, by_network])
+def test_frames_stay_in_the_group_of_their_model(moved, model, shape):
+    steps = 0.2 * torch.randn(5, model.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    matrices = moved(shape, steps)
+    matrices = matrices / matrices[:, 2:, 2:]
+    if model is not Homography:
+        np.testing.assert_allclose(matrices[:, 2], np.tile([0, 0, 1], (5, 1)), atol=1e-9)
+    if model is Translation:
+        np.testing.assert_allclose(matrices[:, :2, :2], np.tile(np.eye(2), (5, 1, 1)), atol=1e-9)
+    if model is Similarity:
+        stretch = np.linalg.svd(matrices[:, :2, :2], compute_uv=False)
+        np.testing.assert_allclose(stretch[:, 0], stretch[:, 1], rtol=1e-9)
+        assert np.ptp(stretch[:, 0]) > 1e-3
+    if model is Affine:
+        stretch = np.linalg.svd(matrices[:, :2, :2], compute_uv=False)
+        assert (stretch[:, 0] / stretch[:, 1] > 1.001).all()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("model", MODELS)
+def test_both_ways_take_the_same_steps(model, shape):
+    steps = 0.2 * torch.randn(3, model.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    first, second = by_registration(shape, steps), by_network(shape, steps)
+    np.testing.assert_allclose(first, second / second[:, 2:, 2:], atol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS)
 def test_the_tangent_is_how_points_move(model):
-    freedom = DEGREES_OF_FREEDOM[model]
     points = torch.rand(30, 2) * torch.tensor([37.0, 31.0])
-    for generator in range(freedom):
+    for generator in range(model.dof):
         motion = FrameMotion(1, (31, 37))
-        step = torch.zeros(1, freedom)
+        step = torch.zeros(1, model.dof)
         step[0, generator] = 1e-3
-        along_x, along_y = motion.tangent(points, freedom)
+        along_x, along_y = motion.tangent(points, model.dof)
         motion.move(step)
         moved = (motion.apply(points)[0] - points) / 1e-3
         expected = torch.stack([along_x[:, generator], along_y[:, generator]], dim=1)
         torch.testing.assert_close(moved, expected, rtol=0.02, atol=0.05)
-
-
-def test_a_similarity_keeps_angles_and_an_affine_parallels():
-    motion = FrameMotion(2, (31, 37))
-    motion.move(torch.tensor([[0.1, -0.2, 0.3, 0.1], [0, 0, 0, 0]]))
-    linear = motion.scene_from_frame[0, :2, :2].numpy()
-    np.testing.assert_allclose(linear.T @ linear, np.eye(2) * (linear.T @ linear)[0, 0], atol=1e-9)
-    motion = FrameMotion(1, (31, 37))
-    motion.move(torch.tensor([[0.1, -0.2, 0.3, 0.1, 0.2, -0.1]]))
-    np.testing.assert_allclose(motion.scene_from_frame[0, 2], [0, 0, 1], atol=1e-9)
-
-
-def test_motion_is_relative_to_the_frame_asked_for():
-    motion = FrameMotion(3, (31, 37))
-    motion.shift(np.array([[1.0, 2.0], [4.0, 6.0], [0.0, 0.0]]))
-    relative = motion.relative_to(1)
-    np.testing.assert_allclose(relative[1], np.eye(3))
-    np.testing.assert_allclose(relative[0, :2, 2], [-3, -4])

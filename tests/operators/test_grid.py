@@ -71,7 +71,7 @@ def test_a_blurred_point_is_a_gaussian():
 
 def test_a_footprint_is_a_disc_of_its_radius_and_its_own_adjoint():
     grid = Grid.over((0, 0, 40, 30), 1.0)
-    footprint = Footprint(grid, 3.0)
+    footprint = Footprint(grid, 3.0, torch.device("cpu"))
     first, second = torch.rand(2, *grid.shape)
     assert float((footprint(first) * second).sum()) == pytest.approx(float((first * footprint(second)).sum()), rel=1e-4)
     kernel = disc(3.0, 0.05)

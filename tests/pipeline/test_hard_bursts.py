@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst import Burst, load, reconstruct
-from napari_fiberburst.errors import BurstError, SettingsError
+from napari_fiberburst.errors import BundleError, SettingsError
 from napari_fiberburst.quality import motion_error, psnr, ssim
 from napari_fiberburst.simulation import Camera, simulate
 
@@ -145,7 +145,7 @@ def test_without_a_bundle_it_says_so_and_resolves_better_than_one_frame():
     noisy = simulated.truth + np.random.default_rng(0).normal(0, 0.03, simulated.truth.shape)
     result = reconstruct(Burst(np.clip(noisy, 0, 1).astype(np.float32)), fill=True)
     assert any("no bundle" in note for note in result.notes)
-    assert result.cores is None
+    assert not result.bundle.is_resolved
     assert motion_error(result.homographies, simulated.homographies, SHAPE) < 0.2
     assert psnr(result.image, simulated.truth[0]) > psnr(noisy[0], simulated.truth[0]) + 2
 
@@ -204,19 +204,19 @@ def test_a_calibration_image_may_be_a_file_and_is_cropped_along(cores, tmp_path)
     np.save(tmp_path / "bundle.npy", cores.transmission * 255)
     burst = cores.burst.crop((10, 117), (5, 131))
     result = reconstruct(burst, calibration=tmp_path / "bundle.npy", fill=True)
-    lit = result.cores.gains > 0.3
-    place = np.rint(result.cores.centres[lit]).astype(int)
+    lit = result.bundle.brightness > 0.3
+    place = np.rint(result.bundle.centres[lit]).astype(int)
     inside = (place >= 0).all(axis=1) & (place < [126, 107]).all(axis=1)
     there = cores.transmission[place[inside, 1] + 10, place[inside, 0] + 5]
-    assert np.corrcoef(there, result.cores.gains[lit][inside])[0, 1] > 0.9
+    assert np.corrcoef(there, result.bundle.brightness[lit][inside])[0, 1] > 0.9
 
 
 @pytest.mark.parametrize(
     ("choices", "error", "said"),
     [
-        ({"calibration": np.zeros((7, 9))}, BurstError, "the size of a frame"),
-        ({"calibration": "no such file.png"}, BurstError, "expected a picture"),
-        ({"preset": "paper", "calibration": np.zeros(SHAPE)}, SettingsError, "no use for a calibration"),
+        ({"calibration": np.zeros((27, 29))}, BundleError, "is black"),
+        ({"calibration": "no such file.png"}, BundleError, "expected a picture"),
+        ({"preset": "paper", "calibration": np.eye(27)}, SettingsError, "no model of the bundle"),
         ({"motion": "flow"}, SettingsError, "needs a network"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from napari_fiberburst import Burst, Control, load, reconstruct
-from napari_fiberburst.errors import BurstError, SettingsError
+from napari_fiberburst.errors import BundleError, SettingsError
 from napari_fiberburst.quality import motion_error, psnr, ssim
 from napari_fiberburst.simulation import Camera, simulate
 
@@ -39,16 +39,16 @@ def test_it_comes_as_close_as_knowing_the_bundle(cores, fitted):
 
 
 def test_what_is_known_comes_with_the_picture(cores, fitted):
-    count = len(fitted.cores.centres)
+    count = len(fitted.bundle.centres)
     assert fitted.coverage.shape == fitted.uncertainty.shape == SHAPE
-    assert fitted.transmission.shape == (*SHAPE, 3)
+    assert fitted.bundle.transmission.shape == SHAPE
     assert fitted.residuals.shape == (12, count)
-    assert fitted.cores.pitch == pytest.approx(6, rel=0.03)
+    assert fitted.bundle.pitch == pytest.approx(6, rel=0.03)
     assert abs(count / len(cores.bundle.centres) - 1) < 0.05
     assert (fitted.confidence > 0.8).all()
     assert 2 < fitted.resolution < 12
     # Off frame 0's own view coverage falls; about the middle all frames have looked.
-    per_pixel = count * 12 * np.pi * fitted.cores.radius**2 / np.prod(SHAPE)
+    per_pixel = count * 12 * np.pi * fitted.bundle.radius**2 / np.prod(SHAPE)
     assert np.median(fitted.coverage) == pytest.approx(per_pixel, rel=0.4)
     assert fitted.sample_error == pytest.approx(np.sqrt(np.nanmean(fitted.residuals**2)), rel=0.6)
 
@@ -203,7 +203,7 @@ def test_very_dim_recordings_do_as_well(cores, fitted):
 
 
 def test_a_calibration_image_of_something_else_is_refused(cores):
-    with pytest.raises(BurstError, match="shows no bundle"):
+    with pytest.raises(BundleError, match="shows no bundle"):
         reconstruct(cores.burst, calibration=np.full(SHAPE, 200.0))
 
 

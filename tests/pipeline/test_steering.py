@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from napari_fiberburst import Control, reconstruct
+from napari_fiberburst.coordinates import in_pixels, relative_to
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.pipeline.problem import Problem
+from napari_fiberburst.networks.field import JointField
+from napari_fiberburst.networks.training import Problem
 from napari_fiberburst.settings import choose
 
 
@@ -27,7 +29,10 @@ def test_stopping_before_the_first_step_gives_the_start(fit, tiny_burst):
     result = fit(tiny_burst, control=control)
     assert len(result.losses) == 0
     assert np.isfinite(result.image).all()
-    np.testing.assert_array_equal(result.homographies, np.tile(np.eye(3), (5, 1, 1)))
+    np.testing.assert_array_equal(result.homographies[0], np.eye(3))
+    start = JointField(result.settings, tiny_burst.shape).motion.scene_from_frame().detach().numpy()
+    expected = relative_to(in_pixels(start.astype(np.float64), (31, 37)), 0)
+    np.testing.assert_allclose(result.homographies, expected, atol=1e-6)
 
 
 def test_a_time_budget_ends_the_run(fit, tiny_burst):
@@ -74,7 +79,7 @@ def test_a_pause_does_not_count_as_time(fit, tiny_burst, monkeypatch):
         def wait_while_paused(self, should_stop=None):
             now[0] += 100
 
-    monkeypatch.setattr("napari_fiberburst.pipeline.network.time.perf_counter", clock)
+    monkeypatch.setattr("napari_fiberburst.pipeline.supervise.time.perf_counter", clock)
     result = fit(tiny_burst, control=LongPause(), time_budget=50.0, iterations=7)
     assert result.ending == "finished"
     assert len(result.losses) == 7

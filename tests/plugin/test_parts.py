@@ -17,7 +17,6 @@ from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.plugin.history import History, Moment
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
-from napari_fiberburst.results.diagnostics import Cores
 from napari_fiberburst.results.reconstruction import Canvas
 
 
@@ -185,21 +184,16 @@ def test_stabilised_frames_stand_still():
     assert still[2].compute().max() == 0
 
 
-def test_residuals_are_drawn_about_their_cores():
-    cores = Cores(
-        centres=np.array([[8.0, 5.0], [20.0, 15.0]]),
-        gains=np.ones(2),
-        radius=1.5,
-        pitch=4.0,
-        saturated=np.zeros(2, bool),
-        dead=np.empty((0, 2)),
-    )
-    maps = residual_maps(np.array([[1, 2], [3, np.nan]], np.float32), cores, (21, 31))
-    first = maps[0].compute()
-    assert first[5, 8] == first[7, 9] == 1
-    assert first[15, 20] == 2
-    assert np.isnan(first[0, 30])
-    assert maps[1].compute()[5, 8] == 3
+def test_residuals_are_drawn_in_the_pixels_of_their_cores():
+    labels = np.full((21, 31), 2, np.int32)
+    labels[3:8, 4:9], labels[10:15, 20:25] = 0, 1
+    maps = residual_maps(np.array([[1, 2], [3, np.nan]], np.float32), labels)
+    assert maps.shape == (2, 21, 31)
+    first, second = np.asarray(maps)
+    assert (first[3:8, 4:9] == 1).all()
+    assert (first[10:15, 20:25] == 2).all()
+    assert np.isfinite(first).sum() == 50
+    assert np.isfinite(second).sum() == 25
 
 
 def test_a_dask_burst_is_read_a_frame_at_a_time():

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from napari_fiberburst.reconstruction import Canvas
 
 from napari_fiberburst import load
+from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import OutputError, SettingsError
 
 

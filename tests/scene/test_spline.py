@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from napari_fiberburst.operators.grid import Grid
-from napari_fiberburst.scene.image import SplinePicture
-from napari_fiberburst.scene.spline import Normal
+from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.scene.spline import NormalEquations
 
 SHAPE = (41, 54)
 INSIDE = (slice(6, -6), slice(6, -6))
@@ -22,8 +22,8 @@ def wave(points, period):
 
 def solved(points, period, smoothness, radius=None):
     grid = Grid(0.0, 0.0, 1.0, SHAPE)
-    normal = Normal(grid, radius, 1, torch.device("cpu"))
-    normal.add(points, wave(points, period)[:, None], torch.ones(len(points)))
+    empty = NormalEquations.empty(grid, radius, 1, torch.device("cpu"))
+    normal = empty.with_samples(points, wave(points, period)[:, None], torch.ones(len(points)))
     return normal, normal.solve(smoothness, normal.mean(), 200)
 
 
@@ -38,7 +38,7 @@ def test_a_picture_does_not_overshoot_as_its_spline_does(period, overshoot):
     normal, scene = solved(everywhere(), period, 1e-4)
     truth = wave(normal.grid.nodes(), period)
     spline, picture = (
-        float((shown[0] - truth)[INSIDE].abs().max()) / 0.3 for shown in (scene, normal.picture(scene, 1e-4))
+        float((shown[0] - truth)[INSIDE].abs().max()) / 0.3 for shown in (scene, normal.image(scene, 1e-4))
     )
     assert spline == pytest.approx(overshoot, rel=0.15)
     assert picture < 0.04
@@ -55,7 +55,7 @@ def test_where_the_prior_leads_a_picture_has_what_it_leaves_of_a_wave(radius):
     expected = left * (wave(normal.grid.nodes(), period) - 0.5)
     if radius is not None:  # the samples are of the wave itself, which the solution takes for filtered
         expected = expected / float(normal.footprint.transfer(*frequency[::-1]))
-    shown = normal.picture(scene, smoothness)[0] - 0.5
+    shown = normal.image(scene, smoothness)[0] - 0.5
     inside = (slice(14, -14), slice(14, -14))
     torch.testing.assert_close(shown[inside], expected[inside], atol=0.015, rtol=0)
 
@@ -63,14 +63,14 @@ def test_where_the_prior_leads_a_picture_has_what_it_leaves_of_a_wave(radius):
 def test_samples_on_the_nodes_are_left_as_they_are():
     points = Grid(0.0, 0.0, 1.0, SHAPE).nodes().reshape(-1, 2)
     normal, scene = solved(points, 4.0, 1e-6)
-    torch.testing.assert_close(normal.picture(scene, 1e-6)[0][INSIDE], scene[0][INSIDE], atol=1e-5, rtol=0)
+    torch.testing.assert_close(normal.image(scene, 1e-6)[0][INSIDE], scene[0][INSIDE], atol=1e-5, rtol=0)
     torch.testing.assert_close(scene[0], wave(normal.grid.nodes(), 4.0), atol=1e-3, rtol=0)
 
 
 def test_a_picture_is_as_sharp_between_its_nodes_as_at_them():
     normal, scene = solved(everywhere(), 4.0, 1e-4)
-    picture = SplinePicture(
-        scene=normal.picture(scene, 1e-4),
+    picture = SplineImage(
+        scene=normal.image(scene, 1e-4),
         grid=normal.grid,
         known=torch.ones(SHAPE, dtype=torch.bool),
         reach=3.0,
@@ -84,5 +84,5 @@ def test_a_picture_is_as_sharp_between_its_nodes_as_at_them():
 
 
 def test_a_picture_of_nothing_is_finite():
-    normal = Normal(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
-    assert torch.isfinite(normal.picture(normal.solve(0.1, normal.mean()), 0.1)).all()
+    normal = NormalEquations.empty(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
+    assert torch.isfinite(normal.image(normal.solve(0.1, normal.mean()), 0.1)).all()

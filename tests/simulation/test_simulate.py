@@ -217,7 +217,7 @@ def test_usaf_elements_grow_finer_by_the_sixth_root_of_two(rng):
         ({"motion": np.stack([np.eye(3), np.zeros((3, 3))])}, "must have an inverse"),
         ({"motion": np.eye(3)}, "must have shape"),
         ({"physics": "wave"}, "known: mask, core"),
-        ({"frames": 1}, "frames must be an integer of at least 2"),
+        ({"frames": 0}, "frames must be an integer of at least 1"),
         ({"frames": 3.0}, "frames must be an integer"),
         ({"shape": (8, 40)}, "height must be an integer of at least 16"),
         ({"shape": (40,)}, "shape must be"),

@@ -1,211 +1,247 @@
-"""The bundle's calibration, from the burst alone.
+"""Step 1: calibrate the bundle, from the burst alone.
 
 The object moves and the bundle does not, so the mean of the frames, divided by itself blurred over a few cores, shows
-the bundle: its pitch, its cores, and how much light each pixel passes. What is left of the object in it is told apart
-after the frames have been aligned (see `napari_fiberburst.motion.joint` and `refined`).
+the bundle: its pitch, its cores, and how much light each pixel passes. What the mean still shows of the object is told
+apart after the frames have been registered (`napari_fiberburst.motion.joint`, `remeasure`).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Generator
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.bundle.cores import REACH, brightest, find_cores, find_gaps, footprint_radius, nearest_core
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
+from napari_fiberburst.bundle.lattice import REACH, nearest_core
 from napari_fiberburst.bundle.pitch import find_pitch
-from napari_fiberburst.errors import BurstError
+from napari_fiberburst.bundle.samples import SATURATED, sample_cores
+from napari_fiberburst.data.burst import Acquisition, Burst
+from napari_fiberburst.device import find_device
 from napari_fiberburst.operators.grid import blur, local_mean
+from napari_fiberburst.steps import drain
 
-# Over this many pitches the mean frame is blurred to tell bundle from object. One pitch takes gain for object: it
-# leaves faint clouds that hold a low-contrast object still; many leave the object in the calibration.
+# In pitches: over this much the mean frame is blurred to tell bundle from object. One pitch takes gain for object: it
+# leaves faint clouds that hold a low-contrast object still; many pitches leave the object in the calibration.
 _ENVELOPE = 3.0
-# Below this pitch cores cannot be told apart, and pixels stand for themselves.
+# Pixels. Below this pitch cores cannot be told apart, and pixels stand for themselves.
 LEAST_RESOLVED_PITCH = 2.9
 # Pixels to a side of the blocks that stand for cores where there are none.
 _BLOCK = 4
+# Fewer blobs than this are no bundle.
 _LEAST_CORES = 20
 # Part of the light of a well-lit place below which a place lies outside the bundle.
 _DARK = 0.04
+# The black level is this quantile of the mean frame: the space between cores, or outside the field.
+_BLACK_QUANTILE = 0.002
+# In pitches: a core's footprint before its profile has been measured.
+_USUAL_RADIUS = 0.36
+# Frames that vary less than this part of the median frame are black, white or empty in another way.
+_LEAST_CONTRAST_OF_USUAL = 0.2
+# The mean of few frames still shows an object of much contrast (standard deviation of a core's light over the frames,
+# relative to its mean), and a gain taken from it would hide that object: all cores then start as equal. In low contrast
+# the cores' own differences would hold the object still.
+_FEW_FRAMES, _MUCH_CONTRAST = 8, 0.022
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Calibration:
-    """What is known of a bundle. Tensors are on the run's device.
-
-    Attributes
-    ----------
-    pitch : float
-        Distance of neighbouring cores, pixels; of blocks of pixels where no cores can be told apart.
-    has_bundle : bool
-        Whether the pictures show a bundle at all.
-    is_resolved : bool
-        Whether its cores can be told apart.
-    is_trusted : bool
-        Whether the transmission comes from a calibration image, so that gains need not be found.
-    black : float
-        Intensity, 0 to 1, that stands for no light.
-    transmission : Tensor
-        (H, W), 1 where a typical core is brightest; 0 outside the cores.
-    labels : Tensor
-        (H, W) int64, the core that each pixel shows; N where none.
-    centres : Tensor
-        (N, 2) as (x, y).
-    dead : numpy.ndarray
-        (M, 2), places in the lattice without light.
-    radius : float
-        Of a core's footprint, pixels.
-    """
-
-    pitch: float
-    has_bundle: bool
-    is_resolved: bool
-    is_trusted: bool
-    black: float
-    transmission: Tensor
-    labels: Tensor
-    centres: Tensor
-    dead: np.ndarray
-    radius: float
-
-    @property
-    def remark(self) -> str:
-        """What a user should know of the bundle; nothing where all is as usual."""
-        if not self.has_bundle:
-            return "no bundle is seen in the frames; they are taken as plain pictures"
-        return "" if self.is_resolved else "the cores are too close to be told apart; pixels stand for themselves"
-
-    def refined(self, transmission: Tensor) -> "Calibration":
-        """Return the calibration with a better transmission (H, W), in its scale where it is brightest."""
-        own = self.labels < len(self.centres)
-        transmission = torch.where(own, transmission.clamp_min(0), torch.zeros_like(transmission))
-        transmission = transmission / _bright(transmission[own])
-        radius = footprint_radius(transmission, self.labels, self.centres, self.pitch)
-        return replace(self, transmission=transmission, radius=radius if self.is_resolved else self.radius)
-
-    def with_even_gains(self) -> "Calibration":
-        """Return the calibration with all cores equally bright, for bursts in which gain and object look the same."""
-        if not self.is_resolved or self.is_trusted:
-            return self
-        own = self.labels < len(self.centres)
-        peaks = brightest(self.transmission, self.labels, len(self.centres), self.pitch)
-        transmission = torch.zeros_like(self.transmission)
-        transmission[own] = self.transmission[own] / peaks[self.labels[own]]
-        return self.refined(transmission)
-
-
-def calibrate(frames: Tensor, image: Tensor | None = None) -> Calibration:
-    """Calibrate the bundle.
-
-    Raises BurstError where the image shows no bundle though the frames do.
+def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
+    """Calibrate the bundle from the mean of a burst's frames.
 
     Parameters
     ----------
-    frames : Tensor
-        (T, H, W) grey intensities, 0 to 1.
-    image : Tensor, optional
-        (H, W), the bundle with nothing but even light before it, 0 to 1; never needed.
+    burst : Burst
+        Frames of a moving object. From a still one, or from a single frame, the object is taken for the bundle's gains.
+    device : str
+        Where to compute.
+
+    Returns
+    -------
+    Bundle
+        Its `pattern` is "none" where the frames show no bundle.
+
+    Examples
+    --------
+    >>> from napari_fiberburst.simulation import simulate
+    >>> calibrate(simulate("cat", shape=(96, 90), frames=6, pitch=6.0).burst).is_resolved
+    True
     """
-    mean = frames.mean(dim=0) if image is None else image
+    frames = torch.from_numpy(burst.frames).to(find_device(device))
+    return drain(calibrating(frames.mean(dim=3), burst))
+
+
+def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, Bundle]:
+    """Calibrate the bundle from grey frames (T, H, W) in [0, 1]; yields the name of each step that is done."""
+    mean = grey[exposed(grey)].mean(dim=0)
+    origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
+    bundle = yield from calibrating_mean(mean, acquisition, origin)
+    if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
+        samples = sample_cores(grey[..., None], bundle, acquisition)
+        light = samples.values[..., 0]
+        contrast = float((light.std(dim=0) / light.mean(dim=0).abs().clamp_min(1e-6)).median()) if len(light) > 1 else 0
+        if contrast > _MUCH_CONTRAST:
+            bundle = with_even_gains(bundle)
+    return bundle
+
+
+def calibrating_mean(
+    mean: Tensor, acquisition: Acquisition, provenance: dict[str, Any], *, even_light: bool = False
+) -> Generator[str, None, Bundle]:
+    """Calibrate the bundle from one picture of it (H, W) in [0, 1]; yields the name of each step that is done.
+
+    In even light the picture is the transmission; otherwise its slow changes are divided out of it.
+    """
+    told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d")}
+    gain_weight = 1.0 if even_light else 0.0
     pitch = find_pitch(mean)
-    if pitch is None and image is not None and find_pitch(frames.mean(dim=0)) is not None:
-        raise BurstError("the calibration image shows no bundle, but the frames do; give another one, or leave it out")
+    yield "pitch found"
     if pitch is None:
-        return _blocks(torch.ones_like(mean), has_bundle=False, black=0.0)
-    black = float(torch.quantile(_sample(mean), 0.002))
+        return _blocks(torch.ones_like(mean), acquisition, pattern="none", black=0.0, provenance=told)
+    black = float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
     light = (mean - black).clamp_min(0)
     envelope = local_mean(light, _ENVELOPE * pitch)
-    outline = envelope > _DARK * torch.quantile(_sample(envelope), 0.95)
+    outline = envelope > _DARK * torch.quantile(thinned(envelope), 0.95)
     envelope = local_mean(light, _ENVELOPE * pitch, outline.to(light)).clamp_min(1e-6)
     flat = torch.where(outline, light / envelope, torch.zeros_like(light))
+    passed = light if even_light else flat
     if pitch < LEAST_RESOLVED_PITCH:
-        return _blocks(flat if image is None else light, has_bundle=True, black=black, is_trusted=image is not None)
+        return _blocks(passed, acquisition, pattern="unresolved", black=black, gain_weight=gain_weight, provenance=told)
     centres = find_cores(flat, pitch, outline)
+    yield "cores found"
     if len(centres) < _LEAST_CORES:
-        return _blocks(torch.ones_like(mean), has_bundle=False, black=0.0)
-    labels = torch.from_numpy(nearest_core(centres, outline.cpu().numpy(), REACH * pitch)).to(mean.device)
-    draft = Calibration(
+        return _blocks(torch.ones_like(mean), acquisition, pattern="none", black=0.0, provenance=told)
+    # Points are single precision, as all that is computed from them.
+    centres = centres.astype(np.float32).astype(np.float64)
+    labels = nearest_core(centres.astype(np.float32), outline.cpu().numpy(), REACH * pitch)
+    filled = (blur(torch.from_numpy(labels < len(centres)).to(mean), pitch) > 0.45).cpu().numpy()
+    count = len(centres)
+    draft = Bundle(
+        pattern="cores",
         pitch=pitch,
-        has_bundle=True,
-        is_resolved=True,
-        is_trusted=image is not None,
-        black=black,
-        transmission=flat,
-        labels=labels,
-        centres=torch.from_numpy(centres).to(mean),
-        dead=find_gaps(centres, _filled(labels < len(centres), pitch), pitch),
-        radius=0.36 * pitch,
+        radius=_USUAL_RADIUS * pitch,
+        centres=centres,
+        labels=labels.astype(np.int32),
+        transmission=np.zeros(labels.shape, np.float32),
+        gains=np.ones((count, 1), np.float32),
+        gain_weights=np.full(count, gain_weight, np.float32),
+        offsets=np.zeros((count, 1), np.float32),
+        black=in_units(black, acquisition),
+        dead=find_gaps(centres, filled, pitch),
+        saturated=_saturated(mean, labels, count),
+        outline=outline.cpu().numpy(),
+        provenance=told,
     )
-    return draft.refined(flat if image is None else light)
+    return with_transmission(draft, passed)
 
 
-def remeasure(calibration: Calibration, frames: Tensor, predicted: Callable[[int, Tensor], Tensor]) -> Calibration:
-    """Measure the transmission anew, pixel by pixel, once it is known what the object shows there.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        As it is.
-    frames : Tensor
-        (T, H, W) grey intensities.
-    predicted : callable
-        Takes a frame's number and pixels (N, 2), and returns the object's light there, (N,); 0 where unknown.
-    """
-    own = calibration.labels < len(calibration.centres)
-    pixels = own.nonzero().flip(1).to(frames.dtype)
-    light, power = torch.zeros(len(pixels)).to(frames), torch.full((len(pixels),), 1e-9).to(frames)
-    for number, frame in enumerate(frames):
-        seen = predicted(number, pixels)
-        light += (frame[own] - calibration.black) * seen
-        power += seen**2
-    transmission = torch.zeros_like(calibration.transmission)
-    known = power > 1e-3 * power.mean()
-    fallback = calibration.transmission[own] * (light[known].sum() / power[known].sum().clamp_min(1e-9))
-    transmission[own] = torch.where(known, light / power, fallback)
-    return calibration.refined(transmission)
+def exposed(frames: Tensor) -> Tensor:
+    """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
+    deviation = frames.std(dim=(1, 2))
+    bright = (frames >= SATURATED).float().mean(dim=(1, 2))
+    good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
+    return good if bool(good.any()) else torch.ones_like(good)
 
 
-def _blocks(transmission: Tensor, *, has_bundle: bool, black: float, is_trusted: bool = False) -> Calibration:
-    """Return a calibration whose cores are square blocks of pixels."""
-    height, width = transmission.shape
-    columns = -(-width // _BLOCK)
-    row, column = (torch.arange(side, device=transmission.device) // _BLOCK for side in (height, width))
-    labels = row[:, None] * columns + column[None, :]
-    count = int(labels.max()) + 1
-    y, x = torch.meshgrid(
-        torch.arange(height, device=labels.device), torch.arange(width, device=labels.device), indexing="ij"
-    )
-    size = torch.bincount(labels.ravel(), minlength=count)
-    centres = torch.stack(
-        [torch.bincount(labels.ravel(), part.ravel().float(), count) / size for part in (x, y)], dim=1
-    )
-    if has_bundle:
-        transmission = transmission / _bright(transmission)
-    return Calibration(
-        pitch=float(_BLOCK),
-        has_bundle=has_bundle,
-        is_resolved=False,
-        is_trusted=is_trusted or not has_bundle,
-        black=black,
-        transmission=transmission,
-        labels=labels,
-        centres=centres.to(transmission.dtype),
-        dead=np.empty((0, 2)),
-        radius=_BLOCK / np.pi**0.5,
-    )
+def with_transmission(bundle: Bundle, transmission: Tensor) -> Bundle:
+    """Return the bundle with another transmission (H, W), brought to its scale: 1 where a bright core is brightest."""
+    labels = torch.from_numpy(bundle.labels).to(transmission.device).long()
+    own = labels < len(bundle.centres)
+    transmission = torch.where(own, transmission.clamp_min(0), torch.zeros_like(transmission))
+    transmission = transmission / bright_level(transmission[own])
+    radius = bundle.radius
+    if bundle.is_resolved:
+        centres = torch.from_numpy(bundle.centres).to(transmission)
+        radius = footprint_radius(transmission, labels, centres, bundle.pitch)
+    return replace(bundle, transmission=transmission.cpu().numpy(), radius=radius)
 
 
-def _bright(values: Tensor) -> Tensor:
-    return torch.quantile(_sample(values), 0.97).clamp_min(1e-9)
+def with_even_gains(bundle: Bundle) -> Bundle:
+    """Return the bundle with all cores equally bright, where gain and object look the same and no gain is known."""
+    if not bundle.is_resolved or bundle.gains_known:
+        return bundle
+    transmission, labels = torch.from_numpy(bundle.transmission), torch.from_numpy(bundle.labels).long()
+    own = labels < len(bundle.centres)
+    peaks = brightest(transmission, labels, len(bundle.centres), bundle.pitch)
+    even = torch.zeros_like(transmission)
+    even[own] = transmission[own] / peaks[labels[own]]
+    return with_transmission(bundle, even)
 
 
-def _sample(values: Tensor) -> Tensor:
+def remark(bundle: Bundle) -> str:
+    """Return what a user should know of the bundle; nothing where all is as usual."""
+    return {
+        "cores": "",
+        "unresolved": "the cores are too close to be told apart; pixels stand for themselves",
+        "none": "no bundle is seen in the frames; they are taken as plain pictures",
+    }[bundle.pattern]
+
+
+def plain_frames(shape: tuple[int, int], acquisition: Acquisition) -> Bundle:
+    """Return what stands for the bundle before it has been calibrated: every pixel passes all light."""
+    return _blocks(torch.ones(shape), acquisition, pattern="none", black=0.0, provenance={"source": "none"})
+
+
+def in_units(value: float, acquisition: Acquisition) -> float:
+    """Return an intensity of [0, 1] in the recording's units."""
+    return acquisition.black_level + value * (acquisition.white_level - acquisition.black_level)
+
+
+def bright_level(values: Tensor) -> Tensor:
+    """Return what a bright pixel shows: the 97th percentile, so that a few outliers set no scale."""
+    return torch.quantile(thinned(values), 0.97).clamp_min(1e-9)
+
+
+def thinned(values: Tensor) -> Tensor:
     """Return some of the values, evenly taken: torch.quantile takes only so many."""
     flat = values.reshape(-1)
     return flat[:: max(1, len(flat) // 100_000)]
 
 
-def _filled(covered: Tensor, pitch: float) -> np.ndarray:
-    """Return the bundle's area: the cores, and what lies between them."""
-    filled: np.ndarray = (blur(covered.float(), pitch) > 0.45).cpu().numpy()
-    return filled
+def _saturated(mean: Tensor, labels: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+    """Return which cores are, in most of their pixels, too bright for the camera, (N,)."""
+    own = labels < count
+    too_bright = (mean.cpu().numpy() >= SATURATED)[own].astype(np.float64)
+    size = np.bincount(labels[own], minlength=count)
+    saturated: NDArray[np.bool_] = np.bincount(labels[own], too_bright, count) > 0.5 * np.maximum(size, 1)
+    return saturated
+
+
+def _blocks(
+    transmission: Tensor,
+    acquisition: Acquisition,
+    *,
+    pattern: Literal["unresolved", "none"],
+    black: float,
+    provenance: dict[str, Any],
+    gain_weight: float = 0.0,
+) -> Bundle:
+    """Return a bundle whose cores are square blocks of pixels."""
+    height, width = transmission.shape
+    columns = -(-width // _BLOCK)
+    y, x = np.indices((height, width))
+    labels = (y // _BLOCK) * columns + x // _BLOCK
+    count = int(labels.max()) + 1
+    size = np.bincount(labels.ravel(), minlength=count)
+    # Single precision, as all that is computed from points.
+    centres = [(np.bincount(labels.ravel(), part.ravel(), count) / size).astype(np.float32) for part in (x, y)]
+    if pattern != "none":
+        transmission = transmission / bright_level(transmission)
+    return Bundle(
+        pattern=pattern,
+        pitch=float(_BLOCK),
+        radius=_BLOCK / np.pi**0.5,
+        centres=np.stack(centres, axis=1).astype(np.float64),
+        labels=labels.astype(np.int32),
+        transmission=transmission.cpu().numpy(),
+        gains=np.ones((count, 1), np.float32),
+        gain_weights=np.full(count, gain_weight, np.float32),
+        offsets=np.zeros((count, 1), np.float32),
+        black=in_units(black, acquisition),
+        dead=np.empty((0, 2)),
+        saturated=np.zeros(count, dtype=bool),
+        outline=np.ones((height, width), dtype=bool),
+        provenance=provenance,
+    )

@@ -10,10 +10,10 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from napari_fiberburst.bundle.lattice import REACH, nearest_core
 from napari_fiberburst.operators.grid import blur, local_mean
 
-# In pitches: how far a core's light is counted as its own, and how far from all cores a place is a gap in the lattice.
-REACH = 0.62
+# In pitches: how far from all cores a place is a gap in the lattice.
 _GAP = 0.85
 # A core is a blob: two Gaussians of these spreads, in pitches, subtracted. Plain peaks would miss a dim core that leans
 # on a bright one.
@@ -58,18 +58,6 @@ def find_cores(picture: Tensor, pitch: float, outline: Tensor) -> NDArray[np.flo
     )
     found = total > 0
     return np.stack([along_x[found] / total[found], along_y[found] / total[found]], axis=1)
-
-
-def nearest_core(centres: NDArray[np.float64], outline: NDArray[np.bool_], reach: float) -> NDArray[np.int64]:
-    """Return the number of the core nearest to each pixel, (H, W); N where none is within `reach` pixels.
-
-    Pixels outside the bundle's `outline`, (H, W), belong to none.
-    """
-    labels = np.full(outline.shape, len(centres), dtype=np.int64)
-    y, x = np.nonzero(outline)
-    tree = cKDTree(centres)
-    labels[y, x] = tree.query(np.stack([x, y], axis=1), distance_upper_bound=reach, workers=-1)[1]
-    return labels
 
 
 def find_gaps(centres: NDArray[np.float64], outline: NDArray[np.bool_], pitch: float) -> NDArray[np.float64]:

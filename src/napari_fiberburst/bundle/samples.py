@@ -1,150 +1,265 @@
-"""What the sensors of a burst have seen: one value per core, or per lit pixel, and frame.
+"""Step 3: what the bundle has sampled of the scene, one value per core, or per lit pixel, and frame.
 
 In a real bundle there is no detail inside a core: each gathers the light of its footprint and re-emits one value
 through its profile, so one value per core and frame is all there is, and the footprint is part of the model. Where the
-pictures do show detail inside cores (a bundle that merely masks the scene), every lit pixel is a sensor of its own.
+pictures do show detail inside cores (a bundle that merely masks the scene), every lit pixel is a sample of its own.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
 
-from napari_fiberburst.bundle.calibrate import Calibration
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.data.burst import Acquisition, Burst
+from napari_fiberburst.device import find_device
+from napari_fiberburst.stored import Stored
 
 # Pixels that pass less than this part of a bright core's light say little.
 _LEAST_TRANSMISSION = 0.2
-# From this intensity on a pixel is taken as saturated.
+# From this intensity on, full scale 1, a pixel is taken as saturated.
 SATURATED = 0.998
+# A core counts at most as much as this many typical ones, and not at all below this part of one.
+_MOST_WEIGHT, _LEAST_WEIGHT = 3.0, 0.02
 # Part of the detail predicted inside cores that must be there to count as real.
 _LEAST_DETAIL = 0.4
+# So many samples, and frames, are enough to tell.
 _DETAIL_SAMPLES = 300_000
 _LEAST_DETAIL_FRAMES = 4
+# Only pixels that pass at least this part of a bright core's light are asked.
+_LIT = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Observation:
-    """Samples of the scene by N sensors in T frames.
+class Samples(Stored):
+    """Samples of the scene at N places in T frames. Tensors are on the device of the run.
 
     Attributes
     ----------
     kind : str
         "cores" or "pixels".
     positions : Tensor
-        (N, 2), where the sensors are, frame pixels.
+        (N, 2) as (x, y), where the samples are taken, frame pixels.
     values : Tensor
-        (T, N, C), the light of the scene at each sensor, as a bright core would show it, 0 to 1.
+        (T, N, C), the light of the scene at each place, as a bright core would show it, full scale 1.
     weights : Tensor
         (T, N), how much each sample counts, 1 for a typical one; 0 where there is none.
-    sources : Tensor
-        (N,) int64, the core that each sensor belongs to.
+    core_index : Tensor
+        (N,) int64, the core that each sample comes through.
+    cores : int
+        How many cores the bundle has.
     radius : float or None
-        Of the sensors' footprint, pixels; None for points.
+        Of the footprint of each sample, pixels; None for points.
+    shape : (int, int)
+        Height and width of a frame, pixels.
+    pitch : float
+        Distance of neighbouring cores, pixels.
+    gains_known : bool
+        Whether the gains of the cores are known, so that none are to be found from the burst.
     """
+
+    _kind: ClassVar[str] = "set of samples"
 
     kind: Literal["cores", "pixels"]
     positions: Tensor
     values: Tensor
     weights: Tensor
-    sources: Tensor
+    core_index: Tensor
+    cores: int
     radius: float | None
+    shape: tuple[int, int]
+    pitch: float
+    gains_known: bool
 
-    def with_gains(self, gains: Tensor) -> "Observation":
-        """Return the observation with each core's gain (G,) or (G, C) taken out of its values."""
-        own = gains[self.sources]
+    @property
+    def grey(self) -> Tensor:
+        """Values averaged over the channels, (T, N)."""
+        return self.values.mean(dim=2)
+
+    def without_gains(self, gains: Tensor) -> "Samples":
+        """Return the samples with each core's gain (G,) or (G, C) taken out of their values."""
+        own = gains[self.core_index]
         if own.ndim == 1:
             return replace(self, values=self.values / own[:, None], weights=self.weights * own**2)
         return replace(self, values=self.values / own, weights=self.weights * own.mean(dim=1) ** 2)
 
-    def weighted(self, frames: Tensor) -> "Observation":
-        """Return the observation with each frame's weights multiplied by that frame's in `frames`, (T,)."""
+    def weighted(self, frames: Tensor) -> "Samples":
+        """Return the samples with each frame's weights multiplied by that frame's in `frames`, (T,)."""
         return replace(self, weights=self.weights * frames.to(self.weights)[:, None])
 
 
-def observe_cores(frames: Tensor, calibration: Calibration) -> Observation:
-    """Reduce frames (T, H, W, C) to one value per core: the least-squares amplitude of its profile.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BundleTensors:
+    """A bundle on a device, in the intensities of one burst.
+
+    Attributes
+    ----------
+    own : Tensor
+        (H, W) bool, pixels that belong to a core.
+    labels : Tensor
+        (H, W) int64, the core of each pixel; N where none.
+    transmission : Tensor
+        (H, W).
+    centres : Tensor
+        (N, 2).
+    gains, offsets : Tensor
+        (N, C or 1); offsets with full scale 1.
+    black : float
+        Full scale 1.
+    """
+
+    own: Tensor
+    labels: Tensor
+    transmission: Tensor
+    centres: Tensor
+    gains: Tensor
+    offsets: Tensor
+    black: float
+
+    @classmethod
+    def of(cls, bundle: Bundle, acquisition: Acquisition, device: torch.device) -> "BundleTensors":
+        """Bring a bundle to a device."""
+        span = acquisition.white_level - acquisition.black_level
+        labels = torch.from_numpy(bundle.labels).to(device).long()
+        return cls(
+            own=labels < len(bundle.centres),
+            labels=labels,
+            transmission=torch.from_numpy(bundle.transmission).to(device),
+            centres=torch.from_numpy(bundle.centres).float().to(device),
+            gains=torch.from_numpy(bundle.gains).to(device),
+            offsets=torch.from_numpy(bundle.offsets).to(device) / span,
+            black=(bundle.black - acquisition.black_level) / span,
+        )
+
+    def per_channel(self, values: Tensor, channels: int) -> Tensor:
+        """Return gains or offsets (N, C or 1) for frames of so many channels; their mean where the number differs."""
+        return values if values.shape[1] in (1, channels) else values.mean(dim=1, keepdim=True)
+
+
+def sample(
+    burst: Burst, bundle: Bundle, kind: Literal["cores", "pixels"] = "cores", *, device: str = "auto"
+) -> Samples:
+    """Take what the bundle has sampled of the scene out of a burst's frames.
+
+    Parameters
+    ----------
+    burst : Burst
+        The frames.
+    bundle : Bundle
+        Of the same size, at the place where it is in these frames.
+    kind : str
+        "cores": one value a core, the least-squares amplitude of its profile. "pixels": every lit pixel, divided by its
+        transmission.
+    device : str
+        Where to compute.
+
+    Returns
+    -------
+    Samples
+        With all frames in it; `register` finds those that do not belong.
+    """
+    frames = torch.from_numpy(burst.frames).to(find_device(device))
+    return (sample_pixels if kind == "pixels" else sample_cores)(frames, bundle, burst)
+
+
+def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Samples:
+    """Reduce frames (T, H, W, C) to one value a core: the least-squares amplitude of its profile.
 
     Saturated pixels are left out of it.
     """
-    count, channels = len(calibration.centres), frames.shape[-1]
-    own = calibration.labels < count
-    labels, profile = calibration.labels[own], calibration.transmission[own]
+    known = BundleTensors.of(bundle, acquisition, frames.device)
+    count, channels = len(known.centres), frames.shape[-1]
+    labels, profile = known.labels[known.own], known.transmission[known.own]
     values = torch.zeros(len(frames), count, channels).to(frames)
     power = torch.zeros(len(frames), count).to(frames)
     for number, frame in enumerate(frames):
-        light = frame[own]
+        light = frame[known.own]
         usable = profile * (light.amax(dim=1) < SATURATED)
-        values[number].index_add_(0, labels, (light - calibration.black) * usable[:, None])
+        values[number].index_add_(0, labels, (light - known.black) * usable[:, None])
         power[number].index_add_(0, labels, usable * profile)
     typical = power[power > 0].median() if (power > 0).any() else power.new_tensor(1.0)
-    weights = (power / typical).clamp(max=3)
-    enough = weights > 0.02
-    return Observation(
+    weights = (power / typical).clamp(max=_MOST_WEIGHT)
+    enough = weights > _LEAST_WEIGHT
+    values = torch.where(enough[..., None], values / power.clamp_min(1e-9)[..., None], torch.zeros_like(values))
+    gains, offsets = (known.per_channel(part, channels) for part in (known.gains, known.offsets))
+    return Samples(
         kind="cores",
-        positions=calibration.centres,
-        values=torch.where(enough[..., None], values / power.clamp_min(1e-9)[..., None], torch.zeros_like(values)),
+        positions=known.centres,
+        values=(values - offsets) / gains,
         weights=weights * enough,
-        sources=torch.arange(count, device=frames.device),
-        radius=calibration.radius,
+        core_index=torch.arange(count, device=frames.device),
+        cores=count,
+        radius=bundle.radius,
+        shape=bundle.shape,
+        pitch=bundle.pitch,
+        gains_known=bundle.gains_known,
     )
 
 
-def observe_pixels(frames: Tensor, calibration: Calibration) -> Observation:
-    """Take every lit pixel of frames (T, H, W, C) as a sensor that sees one point of the scene."""
-    lit = (calibration.labels < len(calibration.centres)) & (calibration.transmission > _LEAST_TRANSMISSION)
-    passed = calibration.transmission[lit]
+def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Samples:
+    """Take every lit pixel of frames (T, H, W, C) as a sample of one point of the scene."""
+    known = BundleTensors.of(bundle, acquisition, frames.device)
+    lit = known.own & (known.transmission > _LEAST_TRANSMISSION)
+    passed, labels = known.transmission[lit], known.labels[lit]
     light = frames[:, lit]
-    weights = passed**2 * (light.amax(dim=2) < SATURATED)
-    return Observation(
+    gains, offsets = (known.per_channel(part, frames.shape[-1])[labels] for part in (known.gains, known.offsets))
+    return Samples(
         kind="pixels",
         positions=lit.nonzero().flip(1).to(frames.dtype),
-        values=(light - calibration.black) / passed[:, None],
-        weights=weights,
-        sources=calibration.labels[lit],
+        values=((light - known.black) / passed[:, None] - offsets) / gains,
+        weights=passed**2 * (light.amax(dim=2) < SATURATED),
+        core_index=labels,
+        cores=len(known.centres),
         radius=None,
+        shape=bundle.shape,
+        pitch=bundle.pitch,
+        gains_known=bundle.gains_known,
     )
 
 
 def shows_detail(
-    frames: Tensor, calibration: Calibration, cores: Observation, predicted: Callable[[int, Tensor], Tensor]
+    grey: Tensor, bundle: Bundle, acquisition: Acquisition, cores: Samples, predicted: Callable[[int, Tensor], Tensor]
 ) -> bool:
-    """Whether the frames show detail inside cores, rather than one value per core.
+    """Whether the frames show detail inside cores, rather than one value a core.
 
-    The aligned scene, which knows a core's surroundings from other frames, predicts how light should vary inside the
+    The registered scene, which knows a core's surroundings from other frames, predicts how light should vary inside the
     core, relative to its mean. Where there is detail, what pixels show follows that prediction as it changes from frame
-    to frame; behind real fibres it does not. What stands still is left out of the comparison, for the transmission,
-    measured with that same prediction, shares it.
+    to frame; behind real fibres it does not. Only changes from frame to frame are compared, because what stands still
+    is in the transmission too, which was measured with that same prediction.
 
     Parameters
     ----------
-    frames : Tensor
-        (T, H, W) grey intensities.
-    calibration : Calibration
-        With a transmission that was measured after alignment.
-    cores : Observation
+    grey : Tensor
+        (T, H, W) intensities in [0, 1].
+    bundle : Bundle
+        With a transmission that was measured after registration.
+    acquisition : Acquisition
+        Of the burst.
+    cores : Samples
         Of the same frames, grey.
     predicted : callable
-        As for `napari_fiberburst.bundle.calibrate.remeasure`.
+        As for `napari_fiberburst.bundle.transmission.remeasure`.
     """
-    lit = (calibration.labels < len(calibration.centres)) & (calibration.transmission > 0.5)
-    pixels = lit.nonzero().flip(1).to(frames.dtype)
-    labels, passed = calibration.labels[lit], calibration.transmission[lit]
-    count = len(calibration.centres)
-    area = torch.zeros(count).to(frames).index_add_(0, labels, passed**2).clamp_min(1e-9)
-    sums = torch.zeros(5, len(pixels)).to(frames)
-    needed = max(_LEAST_DETAIL_FRAMES, -(-_DETAIL_SAMPLES // len(pixels)))
-    for number in range(0, len(frames), max(1, len(frames) // needed)):
-        seen = predicted(number, pixels)
-        mean = torch.zeros(count).to(frames).index_add_(0, labels, passed**2 * seen) / area
+    known = BundleTensors.of(bundle, acquisition, grey.device)
+    lit = known.own & (known.transmission > _LIT)
+    pixels = lit.nonzero().flip(1).to(grey.dtype)
+    labels, passed = known.labels[lit], known.transmission[lit]
+    count = len(known.centres)
+    area = torch.zeros(count).to(grey).index_add_(0, labels, passed**2).clamp_min(1e-9)
+    sums = torch.zeros(5, len(pixels)).to(grey)
+    needed = max(_LEAST_DETAIL_FRAMES, -(-_DETAIL_SAMPLES // max(1, len(pixels))))
+    for number in range(0, len(grey), max(1, len(grey) // needed)):
+        scene = predicted(number, pixels)
+        mean = torch.zeros(count).to(grey).index_add_(0, labels, passed**2 * scene) / area
         core = cores.values[number, labels].mean(dim=-1)
-        known = (seen > 0) & (cores.weights[number, labels] > 0) & (core > 0) & (mean[labels] > 0)
-        weight = passed**2 * core.square() * known
-        expected = torch.where(known, seen / mean[labels].clamp_min(1e-6) - 1, torch.zeros_like(seen))
-        light = (frames[number][lit] - calibration.black) / passed
-        shown = torch.where(known, light / core.clamp_min(1e-6) - 1, torch.zeros_like(seen))
-        sums += weight * torch.stack([torch.ones_like(seen), expected, shown, expected * shown, expected * expected])
+        usable = (scene > 0) & (cores.weights[number, labels] > 0) & (core > 0) & (mean[labels] > 0)
+        weight = passed**2 * core.square() * usable
+        expected = torch.where(usable, scene / mean[labels].clamp_min(1e-6) - 1, torch.zeros_like(scene))
+        light = (grey[number][lit] - known.black) / passed
+        shown = torch.where(usable, light / core.clamp_min(1e-6) - 1, torch.zeros_like(scene))
+        sums += weight * torch.stack([torch.ones_like(scene), expected, shown, expected * shown, expected * expected])
     mass, expected, shown, both, square = sums
     mass = mass.clamp_min(1e-9)
     agreement = float((both - expected * shown / mass).sum())

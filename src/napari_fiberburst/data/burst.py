@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from napari_fiberburst.errors import BurstError
 
-MIN_FRAMES = 2
 MIN_SIDE = 16
 _FULL_SCALES = tuple(2**bits - 1 for bits in range(8, 33, 2))
 
@@ -192,10 +191,12 @@ def _as_tyxc(frames: Any, axes: str | None) -> tuple[Any, str]:
     if not hasattr(frames, "__array_function__"):  # numpy and dask arrays are sliced as they are
         frames = _stack(frames)
     if axes is None:
-        axes = {3: "TYX", 4: "TYXC"}.get(frames.ndim, "")
+        axes = {2: "YX", 3: "TYX", 4: "TYXC"}.get(frames.ndim, "")
     if not isinstance(axes, str):
         raise BurstError(f'axes must be one letter per axis, such as "CTYX"; got {axes!r}')
     axes = axes.upper().replace("S", "C")
+    if "T" not in axes and {"Y", "X"} <= set(axes) and len(axes) == frames.ndim:
+        frames, axes = frames[None], "T" + axes  # one frame is a burst where its bundle is known
     if not {"T", "Y", "X"} <= set(axes) or len(set(axes)) != len(axes) or len(axes) != frames.ndim:
         raise BurstError(
             "a burst is one stack with axes (time, height, width) or (time, height, width, channel); got shape "
@@ -228,11 +229,8 @@ def _stack(frames: Any) -> NDArray[Any]:
 
 
 def _check_size(shape: tuple[int, ...]) -> None:
-    if shape[0] < MIN_FRAMES:
-        raise BurstError(
-            f"a burst needs at least {MIN_FRAMES} frames, got {shape[0]}; open the frames as one (time, height, "
-            "width) stack"
-        )
+    if shape[0] < 1:
+        raise BurstError("a burst needs at least one frame, got none; check the file or the slice it comes from")
     if min(shape[1:3]) < MIN_SIDE or shape[3] < 1:
         raise BurstError(
             f"frames need at least {MIN_SIDE} pixels a side, got {shape[1]} x {shape[2]} with {shape[3]} channels; "

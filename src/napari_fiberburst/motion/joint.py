@@ -128,7 +128,7 @@ class Groupwise:
         grid = Grid.around(points, level.spacing * self.pitch, 2 * self.pitch)
         self.scene = self.grid.at(grid.nodes(points.device)).read(self.scene)
         self.grid = grid
-        self.footprint = None if radius is None else Footprint(grid, radius)
+        self.footprint = None if radius is None else Footprint(grid, radius, points.device)
         seen = grid.at(self.motion.apply(self.positions)).read(self._through(self.scene))
         self.scene = self.scene * float((self.weights * seen * self.values).sum() / (self.weights * seen**2).sum())
 

@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.homography import relative_to_first
+from napari_fiberburst.coordinates import half_frame_from_pixel, transform_points
 
 # Generators of sl(3) in coordinates of the half frame, in the order in which models grow.
 _GENERATORS = torch.tensor(
@@ -21,12 +21,11 @@ _GENERATORS = torch.tensor(
     ],
     dtype=torch.float64,
 )
-DEGREES_OF_FREEDOM = {"translation": 2, "similarity": 4, "affine": 6, "homography": 8}
 
 
-def generators(freedom: int) -> Tensor:
+def generators(dof: int) -> Tensor:
     """Return the first generators of sl(3), (k, 3, 3) float64, in coordinates of the half frame."""
-    return _GENERATORS[:freedom].clone()
+    return _GENERATORS[:dof].clone()
 
 
 class FrameMotion:
@@ -52,10 +51,7 @@ class FrameMotion:
         self.half = max(height, width) / 2
         self.centre = torch.tensor([(width - 1) / 2, (height - 1) / 2])
         self.scene_from_frame = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
-        x, y = self.centre.tolist()
-        self._unit = torch.tensor(
-            [[1 / self.half, 0, -x / self.half], [0, 1 / self.half, -y / self.half], [0, 0, 1]], dtype=torch.float64
-        )
+        self._unit = torch.from_numpy(half_frame_from_pixel(shape))
 
     def shift(self, translations: NDArray[np.float64]) -> None:
         """Set pure translations (T, 2), pixels."""
@@ -63,17 +59,14 @@ class FrameMotion:
 
     def apply(self, points: Tensor) -> Tensor:
         """Map frame points (N, 2) into the scene, by every frame: (T, N, 2)."""
-        matrix = self.scene_from_frame.to(device=points.device, dtype=points.dtype)
-        mapped = points @ matrix[:, :, :2].mT + matrix[:, None, :, 2]
-        scene_points: Tensor = mapped[..., :2] / mapped[..., 2:]
-        return scene_points
+        return transform_points(self.scene_from_frame.to(device=points.device, dtype=points.dtype), points)
 
-    def tangent(self, points: Tensor, freedom: int) -> tuple[Tensor, Tensor]:
+    def tangent(self, points: Tensor, dof: int) -> tuple[Tensor, Tensor]:
         """Return how scene points (..., 2) move, in pixels along x and y, per unit of each generator: (..., k)."""
         x, y = ((points - self.centre.to(points)) / self.half).unbind(dim=-1)
         one, zero = torch.ones_like(x), torch.zeros_like(x)
-        along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:freedom], dim=-1)
-        along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:freedom], dim=-1)
+        along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:dof], dim=-1)
+        along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:dof], dim=-1)
         return along_x * self.half, along_y * self.half
 
     def move(self, steps: Tensor) -> Tensor:
@@ -96,18 +89,10 @@ class FrameMotion:
             So has one whose area has grown or shrunk by more than this factor.
         """
         width, height = (2 * self.centre + 1).tolist()
-        corners = torch.tensor([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], dtype=torch.float64)
-        mapped = corners @ self.scene_from_frame.mT
-        places = (mapped[..., :2] / mapped[..., 2:]).numpy()
+        corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64)
+        places = transform_points(self.scene_from_frame, corners).numpy()
         x, y = places[..., 0], places[..., 1]
         area = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) / 2 / (height * width)
         way = np.abs(places.mean(axis=1) - [width / 2, height / 2] - shifts).max(axis=1)
         left: NDArray[np.bool_] = ~((area > 1 / most) & (area < most) & (way < max(width, height)))  # NaN has left
         return left
-
-    def relative_to(self, reference: int) -> NDArray[np.float64]:
-        """Return (T, 3, 3), frame-t pixel to the reference frame's pixel; the reference's is the identity."""
-        order = [reference, *(frame for frame in range(len(self.scene_from_frame)) if frame != reference)]
-        relative = np.empty((len(order), 3, 3))
-        relative[order] = relative_to_first(self.scene_from_frame.numpy()[order])
-        return relative

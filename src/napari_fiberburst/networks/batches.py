@@ -1,15 +1,25 @@
-"""The burst as a shuffled stream of (x, y, t) samples, on the device of the run."""
+"""The burst as a shuffled stream of (x, y, t) samples, on the device of the run.
 
+As published, of all pixels of all frames; behind a calibrated bundle, of its samples.
+"""
+
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.coordinates import unit_from_pixel
 from napari_fiberburst.data.burst import Burst
 
 # Spreads the seeds of consecutive epochs, so that seed 0, epoch 1 is not seed 1, epoch 0.
 _SEED_STRIDE = 1_000_003
+# A footprint is sampled at seven points: its centre and six about it, with the second moment of an even disc.
+_RING = math.sqrt(7 / 12)
+# So many of the samples that are left out tell their error well enough.
+_MOST_HELD_OUT = 8192
 
 
 class Batch(NamedTuple):
@@ -37,7 +47,7 @@ class Batch(NamedTuple):
     weights: Tensor | None = None
 
 
-class Samples:
+class PixelStream:
     """Every pixel of every frame, in an order that is shuffled anew each time all have been seen.
 
     The position in the stream is one number, `drawn`: a run that goes on from it sees what it would have seen.
@@ -84,6 +94,73 @@ class Samples:
             self.drawn += len(part)
             count -= len(part)
             yield part
+
+
+class BundleStream:
+    """Every sample of a bundle, in an order that is shuffled anew each time all have been samples.
+
+    Parameters
+    ----------
+    samples : Samples
+        Gains taken out.
+    held_out : float
+        Part of the samples that is left out.
+    seed : int
+        Seed of the shuffles, and of what is left out.
+
+    Attributes
+    ----------
+    drawn : int
+        Samples drawn so far.
+    count : int
+        Samples there are.
+    """
+
+    def __init__(self, samples: Samples, held_out: float, seed: int) -> None:
+        self._values = 2 * samples.values - 1
+        self._weights = samples.weights
+        device = samples.weights.device
+        scale = torch.from_numpy(unit_from_pixel(samples.shape)).to(samples.positions)
+        offsets = torch.zeros(1, 2)
+        if samples.radius is not None:
+            angle = torch.arange(6) * math.pi / 3
+            ring = _RING * samples.radius * torch.stack([angle.cos(), angle.sin()], dim=1)
+            offsets = torch.cat([offsets, ring])
+        places = samples.positions[:, None] + offsets.to(samples.positions)
+        self._places = places * torch.diagonal(scale)[:2] + scale[:2, 2]
+        generator = torch.Generator().manual_seed(seed)
+        chance = torch.rand(samples.weights.shape, generator=generator).to(device)
+        usable = samples.weights > 0
+        self._kept = (usable & (chance >= held_out)).reshape(-1).nonzero()[:, 0]
+        left_out = (usable & (chance < held_out)).reshape(-1).nonzero()[:, 0]
+        self._left_out = left_out[:: max(1, -(-len(left_out) // _MOST_HELD_OUT))]
+        self._seed = seed
+        self._epoch = -1
+        self._order = self._kept
+        self.count = len(self._kept)
+        self.drawn = 0
+
+    def draw(self, count: int) -> Batch:
+        """Return the next `count` samples of the stream."""
+        parts = []
+        while count > 0:
+            epoch, position = divmod(self.drawn, self.count)
+            if epoch != self._epoch:
+                self._order = self._kept[shuffled(self.count, self._seed, epoch, self._kept.device)]
+                self._epoch = epoch
+            part = self._order[position : position + count]
+            self.drawn += len(part)
+            count -= len(part)
+            parts.append(part)
+        return self._batch(torch.cat(parts))
+
+    def left_out(self) -> Batch | None:
+        """Return samples that are never drawn; None where there are none."""
+        return self._batch(self._left_out) if len(self._left_out) else None
+
+    def _batch(self, indices: Tensor) -> Batch:
+        frames, place = indices // len(self._places), indices % len(self._places)
+        return Batch(self._places[place], frames, self._values[frames, place], self._weights[frames, place])
 
 
 def shuffled(count: int, seed: int, epoch: int, device: torch.device) -> Tensor:

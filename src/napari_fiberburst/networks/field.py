@@ -15,16 +15,17 @@ class JointField(nn.Module):
     ----------
     settings : Settings
         Motion, encoding and sizes of the networks, and the seed of their start.
-    frames, channels : int
-        Of the burst.
+    shape : (int, int, int, int)
+        Frames, height, width and channels of the burst.
     start : Tensor, optional
         (T, 3, 3) homographies in unit coordinates, from a registration.
     """
 
-    def __init__(self, settings: Settings, frames: int, channels: int, start: Tensor | None = None) -> None:
+    def __init__(self, settings: Settings, shape: tuple[int, int, int, int], start: Tensor | None = None) -> None:
         super().__init__()
+        frames, height, width, channels = shape
         generator = torch.Generator().manual_seed(settings.seed)
-        self.motion = make_motion(settings.motion, frames, generator, start)
+        self.motion = make_motion(settings.motion, frames, (height, width), generator, start)
         self.scene = make_scene(settings, self.motion.scene_dimensions, channels, generator)
 
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:

@@ -9,15 +9,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.coordinates import in_pixels, unit_from_pixel
+from napari_fiberburst.coordinates import in_pixels, relative_to, unit_from_pixel
 from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError, OutputError
-from napari_fiberburst.homography import relative_to_first
 from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.networks.field import JointField
-from napari_fiberburst.results.reconstruction import Canvas, Reconstruction, draw
-from napari_fiberburst.scene.image import SplinePicture
+from napari_fiberburst.results.reconstruction import Reconstruction, draw
+from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import Settings, Spline
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
@@ -39,7 +39,7 @@ class Representation:
         Adam's moments, to continue exactly; None starts them afresh.
     drawn : int
         Samples drawn so far.
-    behind : SplinePicture, optional
+    behind : SplineImage, optional
         The first picture of a calibrated burst: it knows what no core has looked at, how frames lie, and what
         intensity stands for no light.
     """
@@ -50,7 +50,7 @@ class Representation:
         frame_shape: tuple[int, int],
         optimizer_state: dict[str, Any] | None = None,
         drawn: int = 0,
-        behind: SplinePicture | None = None,
+        behind: SplineImage | None = None,
     ) -> None:
         self.behind = behind
         self.field = field
@@ -84,9 +84,7 @@ class Representation:
         with torch.no_grad():
             scene_from_frame = self.field.motion.scene_from_frame().cpu().numpy().astype(np.float64)
         reference = 0 if self.behind is None else self.behind.reference
-        order = [reference, *(frame for frame in range(len(scene_from_frame)) if frame != reference)]
-        relative = np.empty_like(scene_from_frame)
-        relative[order] = relative_to_first(in_pixels(scene_from_frame[order], self.frame_shape))
+        relative = relative_to(in_pixels(scene_from_frame, self.frame_shape), reference)
         if self.behind is not None:
             relative[~self.behind.used] = np.nan
         return relative
@@ -150,9 +148,9 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         frame0_from_image=np.array(provenance["canvas"]["frame0_from_image"]),
     )
     reference = int(provenance.get("reference", 0))
-    renderer: SplinePicture | Representation
+    renderer: SplineImage | Representation
     if isinstance(settings.encoding, Spline):
-        renderer = SplinePicture.from_arrays(arrays, device)
+        renderer = SplineImage.from_arrays(arrays, device)
         homographies = renderer.homographies
     else:
         renderer = _rebuild_networks(arrays, settings, acquisition, device)
@@ -187,7 +185,7 @@ def _rebuild_networks(
     drawn = int(arrays.pop(_DRAWN))
     kept = {name.removeprefix(_BEHIND): arrays.pop(name) for name in list(arrays) if name.startswith(_BEHIND)}
     start = None if settings.is_published else torch.eye(3).repeat(count, 1, 1)
-    field = JointField(settings, count, channels, start)
+    field = JointField(settings, (count, height, width, channels), start)
     field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    behind = SplinePicture.from_arrays(kept, device) if kept else None
+    behind = SplineImage.from_arrays(kept, device) if kept else None
     return Representation(field.to(device), (height, width), drawn=drawn, behind=behind)

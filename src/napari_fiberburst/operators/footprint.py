@@ -1,6 +1,7 @@
 """The area over which a core gathers light, as a filter of the scene."""
 
 import math
+from functools import lru_cache
 
 import torch
 from scipy.fft import next_fast_len
@@ -25,9 +26,11 @@ class Footprint:
         Where the pictures live; outside, they are 0.
     radius : float
         Of the disc, pixels.
+    device : torch.device
+        Where the pictures are.
     """
 
-    def __init__(self, grid: Grid, radius: float) -> None:
+    def __init__(self, grid: Grid, radius: float, device: torch.device) -> None:
         kernel = disc(radius / grid.spacing, _EDGE / grid.spacing)
         reach = kernel.shape[0] // 2
         self._shape = grid.shape
@@ -35,14 +38,18 @@ class Footprint:
         centred = torch.zeros(self._padded)
         centred[: kernel.shape[0], : kernel.shape[1]] = kernel
         centred = torch.roll(centred, (-reach, -reach), (0, 1))
-        self._response = torch.fft.rfft2(centred).real
+        self._response = torch.fft.rfft2(centred).real.to(device)
         self._kernel = kernel
         self.power = float(kernel.square().sum())
 
+    @staticmethod
+    @lru_cache(maxsize=8)
+    def cached(grid: Grid, radius: float, device: torch.device) -> "Footprint":
+        """Return a footprint, the same one for the same arguments: its response is worth keeping."""
+        return Footprint(grid, radius, device)
+
     def __call__(self, pictures: Tensor) -> Tensor:
         """Return the filtered pictures, (..., H, W)."""
-        if self._response.device != pictures.device:
-            self._response = self._response.to(pictures.device)
         spectrum = torch.fft.rfft2(pictures, s=self._padded) * self._response
         filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
         return filtered

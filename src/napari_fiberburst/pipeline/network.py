@@ -1,9 +1,9 @@
-"""One run: its clock, its losses, its reports, and the states it can go back to."""
+"""Networks at work: steps of Adam, the states a run can go back to, and when it has learned enough."""
 
 import logging
-import time
-from collections.abc import Callable
+from collections.abc import Generator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,25 +12,26 @@ from torch import Tensor
 
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.burst import Burst
-from napari_fiberburst.device import find_device
+from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.networks.image import Representation
-from napari_fiberburst.pipeline.problem import Problem, State
-from napari_fiberburst.pipeline.spline import SelfCalibrated
-from napari_fiberburst.results.progress import Progress
-from napari_fiberburst.results.reconstruction import Canvas, Ending, Reconstruction, draw
+from napari_fiberburst.networks.training import BehindBundle, Problem, State
+from napari_fiberburst.pipeline.diagnose import diagnose
+from napari_fiberburst.pipeline.spline import SplineFit
+from napari_fiberburst.pipeline.stages import Fitted
+from napari_fiberburst.pipeline.supervise import Clock, Snapshot
+from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
 from napari_fiberburst.settings import Fourier, Settings
 
 logger = logging.getLogger(__name__)
 
-# Reports make the host wait for the device, so there are few of them, and more would not be seen.
-_SECONDS_BETWEEN_REPORTS = 0.1
-# Drawing a picture asks the network for every pixel: watching must not slow a fit that is watched.
-_PREVIEWS_SHARE = 0.05
 # Keeping a state copies the networks and Adam's moments.
 _SECONDS_BETWEEN_KEPT_STATES = 1.0
-_PUBLISHED_ITERATIONS, _OBSERVED_ITERATIONS = 3000, 2000
-# Without an end of its own, a fit ends once the samples left out have not been met better for this part of its steps.
+_PUBLISHED_ITERATIONS, _BUNDLE_ITERATIONS = 3000, 2000
+# Early stopping: a fit without an end of its own ends once the error of held-out samples has not improved for this
+# part of its steps.
 _PATIENCE, _LEAST_PATIENCE = 0.4, 150
+# Spread of the Fourier features' frequencies, cycles per pitch: detail between cores is resolved, noise hardly.
+_PERIODS_PER_PITCH = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,72 +43,171 @@ class _Kept:
     state: State
 
 
-class Run:
-    """The bookkeeping of one run.
+class NetworkFit:
+    """A fit of networks behind the bundle: align, then train; see `napari_fiberburst.pipeline.supervise.Method`.
 
     Parameters
     ----------
-    burst, settings, initial
+    burst, settings, initial, control
         As in `napari_fiberburst.iterate`.
-    prepared : SelfCalibrated, optional
-        The burst, calibrated and registered, with a first picture; without, it is fitted as published.
-
-    Attributes
-    ----------
-    step : int
-        Steps done.
-    ending : str
-        Why the run ended, once it has.
+    aligned : SplineFit
+        That aligns the burst.
     """
 
     def __init__(
         self,
         burst: Burst,
         settings: Settings,
+        device: torch.device,
+        control: Control,
         initial: Reconstruction | None,
-        prepared: SelfCalibrated | None = None,
+        aligned: SplineFit,
     ) -> None:
-        self._burst = burst
-        self._settings = settings
-        self._initial = initial
-        self._prepared = prepared
-        self._device = find_device(settings.device)
-        aligned = None if prepared is None else prepared.alignment
-        self._problem = Problem(burst, settings, self._device, initial, aligned)
+        self._burst, self._settings, self._device = burst, settings, device
+        self._control, self._initial = control, initial
+        self._aligned = aligned
+        self._training: Training | None = None
+
+    def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
+        """Align, then train."""
+        yield from self._aligned.align()
+        return (yield from self._start().steps(clock))
+
+    def conclude(self, ending: Ending) -> tuple[Snapshot | None, Ending]:
+        """Take the best state there is."""
+        return (self._training or self._start()).conclude(ending)
+
+    def result(self, ending: Ending, seconds: float) -> Reconstruction:
+        """Return the reconstruction."""
+        assert self._training is not None
+        return self._training.result(ending, seconds)
+
+    def _start(self) -> "Training":
+        """Set up the networks where the alignment has come to."""
+        fitted = self._aligned.round_off()
+        settings = _following_pitch(self._settings, fitted)
+        self._training = Training(self._burst, settings, self._device, self._control, self._initial, fitted)
+        return self._training
+
+
+class Training:
+    """Steps of Adam on a burst as published, or behind its bundle; see `napari_fiberburst.pipeline.supervise.Method`.
+
+    Parameters
+    ----------
+    burst, settings, initial, control
+        As in `napari_fiberburst.iterate`.
+    fitted : Fitted, optional
+        The burst, calibrated and registered, with a first picture; without, it is fitted as published.
+    """
+
+    def __init__(
+        self,
+        burst: Burst,
+        settings: Settings,
+        device: torch.device,
+        control: Control,
+        initial: Reconstruction | None,
+        fitted: Fitted | None = None,
+    ) -> None:
+        self._burst, self._device, self._control, self._initial = burst, device, control, initial
+        self._fitted = fitted
+        behind = None
+        if fitted is not None:
+            assert fitted.samples is not None
+            behind = BehindBundle(fitted.samples, fitted.registration.reference_from_frame)
+        self._problem = Problem(burst, settings, device, initial, behind)
         self._settings = replace(settings, learning_rate=self._problem.learning_rate)
         bounds = (0, 0, burst.shape[2], burst.shape[1])
-        self._canvas = Canvas.over(bounds, settings.upsample) if prepared is None else prepared.canvas
-        self.iterations = settings.iterations or (_OBSERVED_ITERATIONS if prepared else _PUBLISHED_ITERATIONS)
+        self._canvas = Canvas.over(bounds, settings.upsample) if fitted is None else fitted.canvas
+        self._iterations = settings.iterations or (_PUBLISHED_ITERATIONS if fitted is None else _BUNDLE_ITERATIONS)
         self._best: tuple[float, _Kept] | None = None
         self._losses: list[float] = []
         self._pending: list[Tensor] = []
         self._kept: tuple[_Kept, ...] = (_Kept(0, self._settings, self._problem.state()),)
+        self._kept_at = 0.0
         self._live_sigma: float | None = None
-        self._first_done = self._reported = self._previewed = self._drawing = self._kept_at = 0.0
-        self.step = 0
-        self.ending: Ending = "finished"
-        # The first set-up in a process loads much of torch, which is not the run's to answer for.
-        self._started = time.perf_counter() - (0.0 if prepared is None else prepared.seconds)
+        self._image: NDArray[np.float32] | None = None
+        self._has_open_end = settings.iterations is None
+        self._step = 0
 
-    @property
-    def seconds(self) -> float:
-        """Time since the start, pauses left out."""
-        return time.perf_counter() - self._started
+    def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
+        """Take steps until there are enough."""
+        while self._step < self._iterations:
+            self._follow()
+            # The loss stays on the device until someone looks.
+            self._pending.append(self._problem.step())
+            self._step += 1
+            if self._step == 1:
+                clock.start_steps()
+            is_due = (self._step == 1 or clock.is_report_due()) and self._step < self._iterations
+            if not is_due:
+                yield None
+                continue
+            if not self._check_and_keep(clock):
+                return "diverged"
+            has_converged = self._evaluate_held_out()
+            yield self._snapshot()
+            if has_converged:
+                break
+        return "finished"
 
-    def hold_while_paused(self, control: Control, should_stop: Callable[[], bool] | None) -> None:
-        """Wait while the run is paused, and take the wait out of its time."""
-        paused_at = time.perf_counter()
-        control.wait_while_paused(should_stop)
-        self._started += time.perf_counter() - paused_at
+    def conclude(self, ending: Ending) -> tuple[Snapshot | None, Ending]:
+        """Take the state with the least error of held-out samples, and make sure that it can be drawn."""
+        if self._best is not None and ending != "diverged":
+            self._evaluate_held_out()
+            self._problem.restore(self._best[1].state)
+        if ending != "diverged" and self._check_and_keep(None):
+            self._image = self._draw()
+            if not np.isfinite(self._image).all():  # no loss was taken after the last step to tell
+                self._go_back()
+                ending = "diverged"
+                self._image = self._draw()
+        else:
+            ending = "diverged"
+            self._image = self._draw()
+        return (self._snapshot() if self._step else None), ending
 
-    def is_out_of_time(self) -> bool:
-        """Whether the time budget is spent; never before the first step."""
-        budget = self._settings.time_budget
-        return budget is not None and self.step > 0 and self.seconds >= budget
+    def result(self, ending: Ending, seconds: float) -> Reconstruction:
+        """Return the reconstruction."""
+        assert self._image is not None
+        representation = self._representation()
+        losses = np.array(self._losses, dtype=np.float32)
+        before = self._initial
+        return Reconstruction(
+            image=self._image,
+            canvas=self._canvas,
+            homographies=representation.homographies(),
+            losses=losses if before is None else np.concatenate([before.losses, losses]),
+            settings=self._settings,
+            seconds=seconds + (0.0 if before is None else before.seconds),
+            parameters=self._problem.field.parameter_count,
+            device=str(self._device),
+            ending=ending,
+            acquisition=self._burst.acquisition,
+            renderer=representation,
+            **self._diagnostics(),
+        )
 
-    def follow(self, control: Control) -> None:
+    def _diagnostics(self) -> dict[str, Any]:
+        fitted = self._fitted
+        if fitted is None:
+            return {}
+        assert fitted.scene is not None
+        found = diagnose(
+            self._burst,
+            fitted.bundle,
+            fitted.registration,
+            fitted.scene,
+            fitted.canvas,
+            notes=fitted.all_notes,
+            is_scene_shown=False,
+        )
+        return {**found.by_name(), "sample_error": self._error_in_units()}
+
+    def _follow(self) -> None:
         """Take over what a user has changed since the last step."""
-        rate, sigma = control.learning_rate, control.sigma
+        rate, sigma = self._control.learning_rate, self._control.sigma
         if rate is not None and rate != self._settings.learning_rate:
             self._problem.set_learning_rate(rate)
             self._settings = replace(self._settings, learning_rate=rate)
@@ -121,116 +221,47 @@ class Run:
         else:
             logger.warning("sigma %g has no effect: encoding %s has no frequency spread", sigma, encoding.name)
 
-    def advance(self) -> None:
-        """Take one step. The loss stays on the device until someone looks."""
-        self._pending.append(self._problem.step())
-        self.step += 1
-        if self.step == 1:
-            self._first_done = self.seconds
-
-    def is_report_due(self) -> bool:
-        """Whether it is time to look; the last step is reported at the end."""
-        due = self.step == 1 or self.seconds - self._reported >= _SECONDS_BETWEEN_REPORTS
-        return due and self.step < self.iterations
-
-    def is_healthy(self) -> bool:
-        """Whether all losses and all parameters are numbers; else go back to when they were."""
+    def _check_and_keep(self, clock: Clock | None) -> bool:
+        """Return whether all losses and parameters are numbers, and keep such a state; else go back to one."""
         if self._pending:
             self._losses += torch.stack(self._pending).tolist()
             self._pending.clear()
-        if np.isfinite(self._losses).all() and self._problem.is_finite():
-            if self.seconds - self._kept_at >= _SECONDS_BETWEEN_KEPT_STATES:
-                self._kept = (self._kept[-1], _Kept(self.step, self._settings, self._problem.state()))
-                self._kept_at = self.seconds
-            return True
-        self._go_back()
-        return False
+        if not (np.isfinite(self._losses).all() and self._problem.is_finite()):
+            self._go_back()
+            return False
+        if clock is not None and clock.seconds - self._kept_at >= _SECONDS_BETWEEN_KEPT_STATES:
+            self._kept = (self._kept[-1], _Kept(self._step, self._settings, self._problem.state()))
+            self._kept_at = clock.seconds
+        return True
 
-    def has_converged(self) -> bool:
-        """Look at the samples that were left out, and whether they have stopped being met better."""
+    def _evaluate_held_out(self) -> bool:
+        """Take the error of held-out samples, keep the state where it is the least; return whether it has converged."""
         error = self._problem.sample_error()
         if error is None:
             return False
         if self._best is None or error < self._best[0]:
-            self._best = (error, _Kept(self.step, self._settings, self._problem.state()))
-        waited = self.step - self._best[1].step
-        return self._settings.iterations is None and waited > max(_LEAST_PATIENCE, _PATIENCE * self.step)
+            self._best = (error, _Kept(self._step, self._settings, self._problem.state()))
+        waited = self._step - self._best[1].step
+        return self._has_open_end and waited > max(_LEAST_PATIENCE, _PATIENCE * self._step)
 
-    def finish(self) -> None:
-        """Take the state that meets the samples left out best, and make sure that it can be drawn."""
-        if self._best is not None and self.ending != "diverged":
-            self.has_converged()
-            self._problem.restore(self._best[1].state)
-        if self.ending != "diverged" and self.is_healthy():
-            self._image = self._picture()
-            if np.isfinite(self._image).all():
-                return
-            self._go_back()  # no loss was taken after the last step to tell
-        self._image = self._picture()
-
-    def report(self, *, last: bool = False) -> Progress:
-        """Return where the run stands."""
-        settings = self._settings
-        preview = self._image if last and settings.preview_every is not None else None
-        if not last and self._is_preview_due():
-            drawing = self.seconds
-            preview = self._picture()
-            self._previewed, self._drawing = self.seconds, self.seconds - drawing
-        now = self._reported = self.seconds
-        rate = (self.step - 1) / (now - self._first_done) if self.step > 1 else 0.0
-        return Progress(
-            step=self.step,
-            iterations=self.iterations,
+    def _snapshot(self) -> Snapshot:
+        return Snapshot(
+            step=self._step,
+            planned=self._iterations,
             loss=self._losses[-1],
-            seconds=now,
-            rate=rate,
-            remaining=0.0 if last else self._remaining(rate, now),
             homographies=self._representation().homographies(),
-            settings=settings,
-            canvas=self._canvas,
-            preview=preview,
-            sample_error=self._error_in_units(),
-        )
-
-    def _is_preview_due(self) -> bool:
-        wanted = self._settings.preview_every
-        return wanted is not None and self.seconds - self._previewed >= max(wanted, self._drawing / _PREVIEWS_SHARE)
-
-    def result(self) -> Reconstruction:
-        """Return what the run has come to."""
-        representation = self._representation()
-        losses = np.array(self._losses, dtype=np.float32)
-        before = self._initial
-        return Reconstruction(
-            image=self._image,
-            canvas=self._canvas,
-            homographies=representation.homographies(),
-            losses=losses if before is None else np.concatenate([before.losses, losses]),
             settings=self._settings,
-            seconds=self.seconds + (0.0 if before is None else before.seconds),
-            parameters=self._problem.field.parameter_count,
-            device=str(self._device),
-            ending=self.ending,
-            acquisition=self._burst.acquisition,
-            renderer=representation,
-            sample_error=self._error_in_units(),
-            **({} if self._prepared is None else self._prepared.bundle_evidence()),
+            canvas=self._canvas,
+            draw=self._draw,
+            is_milestone=False,
+            held_out_rmse=self._error_in_units(),
         )
 
     def _error_in_units(self) -> float | None:
         return None if self._best is None else self._best[0] * (self._burst.white_level - self._burst.black_level)
 
     def _representation(self) -> Representation:
-        representation = self._problem.representation()
-        representation.behind = None if self._prepared is None else self._prepared.picture
-        return representation
-
-    def _remaining(self, rate: float, now: float) -> float | None:
-        budget = self._settings.time_budget
-        limits = [] if budget is None else [max(0.0, budget - now)]
-        if rate > 0:
-            limits.append((self.iterations - self.step) / rate)
-        return min(limits, default=None)
+        return self._problem.representation(None if self._fitted is None else self._fitted.image)
 
     def _go_back(self) -> None:
         """Return to the newest kept state that is known to be good.
@@ -243,16 +274,24 @@ class Run:
         back = good[-1] if good else self._kept[0]
         logger.warning(
             "the fit stopped giving numbers by step %d; going back to step %d; a learning rate lower than %g may help",
-            self.step,
+            self._step,
             back.step,
             self._settings.learning_rate or 0.0,
         )
         self._problem.restore(back.state)
         self._settings = back.settings
         self._losses = self._losses[: back.step]
-        self.step = back.step
-        self.ending = "diverged"
+        self._step = back.step
 
-    def _picture(self) -> NDArray[np.float32]:
-        reference = 0 if self._prepared is None else self._prepared.alignment.reference
+    def _draw(self) -> NDArray[np.float32]:
+        reference = 0 if self._fitted is None else self._fitted.registration.reference
         return draw(self._representation(), self._canvas, reference, self._burst)
+
+
+def _following_pitch(settings: Settings, fitted: Fitted) -> Settings:
+    """Return the settings with the frequency spread that suits the bundle, where it is left open."""
+    encoding = settings.encoding
+    if not isinstance(encoding, Fourier) or encoding.sigma is not None:
+        return settings
+    sigma = _PERIODS_PER_PITCH * max(fitted.bundle.shape) / 2 / fitted.bundle.pitch
+    return replace(settings, encoding=replace(encoding, sigma=sigma))

@@ -5,26 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from numpy.typing import ArrayLike
 
+from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.device import find_device
-from napari_fiberburst.errors import BurstError, SettingsError
+from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
-from napari_fiberburst.io.folder import read_picture
-from napari_fiberburst.pipeline.network import Run
-from napari_fiberburst.pipeline.spline import SelfCalibrated
+from napari_fiberburst.pipeline.network import NetworkFit, Training
+from napari_fiberburst.pipeline.spline import SplineFit
+from napari_fiberburst.pipeline.supervise import Method, supervise
 from napari_fiberburst.results.progress import Progress
 from napari_fiberburst.results.reconstruction import Reconstruction
-from napari_fiberburst.settings import Encoding, Fourier, Motion, Settings, Spline, choose
-
-# A longer last axis of a calibration image is its width.
-_MOST_CHANNELS = 15
-# Spread of the Fourier features' frequencies, cycles per pitch: detail between cores is resolved, noise hardly.
-_PERIODS_PER_PITCH = 0.3
+from napari_fiberburst.settings import Encoding, Motion, Settings, Spline, choose
 
 
 def reconstruct(
@@ -37,6 +31,7 @@ def reconstruct(
     iterations: int | None = None,
     device: str | None = None,
     seed: int | None = 0,
+    bundle: Bundle | ArrayLike | str | Path | None = None,
     calibration: ArrayLike | str | Path | None = None,
     on_progress: Callable[[Progress], object] | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -67,10 +62,12 @@ def reconstruct(
         "auto", "cpu", "cuda", "cuda:1", "mps".
     seed : int
         The same seed gives the same bits on the same CPU with the same number of threads.
+    bundle : Bundle, array_like or path, optional
+        The bundle, where it is known: a `Bundle`, a file that one was saved to, or a picture of the bundle with nothing
+        but even light before it. It is never needed, but where it is given, one frame is a burst. It may sit up to 5
+        pixels or 2 degrees away from where it was measured; `Reconstruction.notes` then says by how much.
     calibration : array_like or path, optional
-        Picture of the bundle with nothing but even light before it, (H, W) or (H, W, C) like a frame, with the same
-        black and white level; several of them, (T, H, W) or (T, H, W, C), are averaged. Its brightness is used; gains
-        of the channels are found from the burst all the same. Never needed.
+        Short for ``bundle=Bundle.from_image(calibration)``.
     on_progress : callable, optional
         Called with a `Progress` some ten times a second at most, in this thread.
     should_stop : callable, optional
@@ -127,9 +124,19 @@ def reconstruct(
     for name, called in (("on_progress", on_progress), ("should_stop", should_stop)):
         if called is not None and not callable(called):
             raise SettingsError(f"{name} must be a function; got {called!r}")
+    if bundle is not None and calibration is not None:
+        raise SettingsError("calibration is short for bundle=Bundle.from_image(calibration); give one of the two")
     find_device(settings.device)  # before a long read
-    burst = as_burst(frames)
-    run = iterate(burst, settings, control=control, should_stop=should_stop, initial=initial, calibration=calibration)
+    known = bundle if bundle is not None else calibration
+    _check_bundle(settings, known)
+    run = iterate(
+        as_burst(frames),
+        settings,
+        control=control,
+        should_stop=should_stop,
+        initial=initial,
+        bundle=None if known is None else as_bundle(known),
+    )
     while True:
         try:
             report = next(run)
@@ -149,29 +156,13 @@ def as_burst(frames: Burst | ArrayLike | str | Path) -> Burst:
     return Burst(frames)
 
 
-def as_calibration(image: ArrayLike | str | Path | None, burst: Burst) -> torch.Tensor | None:
-    """Return a picture of the bundle in even light as (H, W, C) in [0, 1], on the burst's levels and crop.
-
-    Raises
-    ------
-    BurstError
-        It cannot be read, or its size is not that of the burst's frames.
-    """
-    if image is None:
-        return None
-    pixels = np.asarray(read_picture(image) if isinstance(image, str | Path) else image, dtype=np.float32)
-    if pixels.ndim == 4 or (pixels.ndim == 3 and pixels.shape[2] > _MOST_CHANNELS):
-        pixels = pixels.mean(axis=0)
-    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
-    row, column = burst.origin
-    if pixels.shape[:2] != burst.shape[1:3]:
-        pixels = pixels[row : row + burst.shape[1], column : column + burst.shape[2]]
-    if pixels.shape[:2] != burst.shape[1:3] or not np.isfinite(pixels).all():
-        raise BurstError(
-            f"a calibration image must be finite and have the size of a frame, {burst.shape[1]} x {burst.shape[2]}; "
-            f"got {np.shape(image) if not isinstance(image, str | Path) else image}"
-        )
-    return torch.from_numpy((pixels - burst.black_level) / (burst.white_level - burst.black_level)).float()
+def as_bundle(bundle: Bundle | ArrayLike | str | Path) -> Bundle:
+    """Return a bundle for whatever `reconstruct` takes: a bundle, its file, or a picture of it in even light."""
+    if isinstance(bundle, Bundle):
+        return bundle
+    if isinstance(bundle, str | Path) and Bundle.is_file(bundle):
+        return Bundle.load(bundle)
+    return Bundle.from_image(bundle)
 
 
 def iterate(
@@ -181,7 +172,7 @@ def iterate(
     control: Control | None = None,
     should_stop: Callable[[], bool] | None = None,
     initial: Reconstruction | None = None,
-    calibration: ArrayLike | str | Path | None = None,
+    bundle: Bundle | None = None,
 ) -> Generator[Progress, None, Reconstruction]:
     """Fit a burst and report while it happens; the generator returns the reconstruction.
 
@@ -190,7 +181,7 @@ def iterate(
     burst, settings
         What to fit, and how. A time budget runs from the first step on, while reports are taken too, and leaves
         time for at least one step.
-    control, should_stop, initial, calibration
+    control, should_stop, initial, bundle
         As in `reconstruct`.
 
     Yields
@@ -214,54 +205,23 @@ def iterate(
     control = Control() if control is None else control
     if not isinstance(control, Control):
         raise SettingsError(f"control must be a napari_fiberburst.Control; got {control!r}")
+    _check_bundle(settings, bundle)
     if settings.is_published:
-        if calibration is not None:
-            raise SettingsError("the published method has no use for a calibration image; leave it out, or take auto")
-        return (yield from _train(Run(burst, settings, initial), control, should_stop))
-    fit = SelfCalibrated(burst, settings, as_calibration(calibration, burst))
-    if isinstance(settings.encoding, Spline):
-        if initial is not None:
+        device = find_device(settings.device)
+        method: Method = Training(burst, settings, device, control, initial)
+    else:
+        is_spline = isinstance(settings.encoding, Spline)
+        if is_spline and initial is not None:
             raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
-        return (yield from fit.run(control, should_stop))
-    yield from fit.prepare(control, should_stop)
-    settings = _following_pitch(settings, fit)
-    return (yield from _train(Run(burst, settings, initial, fit), control, should_stop))
+        device = find_device(settings.device)
+        fit = SplineFit(burst, settings, device, bundle)
+        method = fit if is_spline else NetworkFit(burst, settings, device, control, initial, fit)
+    return (yield from supervise(method, settings, control, should_stop))
 
 
-def _train(
-    run: Run, control: Control, should_stop: Callable[[], bool] | None
-) -> Generator[Progress, None, Reconstruction]:
-    """Take a network's steps."""
-    while run.step < run.iterations:
-        run.hold_while_paused(control, should_stop)
-        if control.stopped or (should_stop is not None and should_stop()):
-            run.ending = "stopped"
-            break
-        if run.is_out_of_time():
-            run.ending = "time budget"
-            break
-        run.follow(control)
-        run.advance()
-        if run.is_report_due():
-            if not run.is_healthy():
-                break
-            converged = run.has_converged()
-            yield run.report()
-            if converged:
-                break
-    run.finish()
-    if run.step > 0:
-        yield run.report(last=True)
-    return run.result()
-
-
-def _following_pitch(settings: Settings, fit: SelfCalibrated) -> Settings:
-    """Return the settings with the frequency spread that suits the bundle, where it is left open."""
-    encoding = settings.encoding
-    if not isinstance(encoding, Fourier) or encoding.sigma is not None:
-        return settings
-    sigma = _PERIODS_PER_PITCH * max(fit.alignment.shape) / 2 / fit.alignment.pitch
-    return replace(settings, encoding=replace(encoding, sigma=sigma))
+def _check_bundle(settings: Settings, bundle: object) -> None:
+    if settings.is_published and bundle is not None:
+        raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
 
 
 def _continued(initial: Reconstruction, seed: int | None) -> tuple[Settings, None]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_fiberburst.results.reconstruction import Canvas
+from napari_fiberburst.data.canvas import Canvas
 
 _MOST_BYTES = 128 * 2**20
 

@@ -9,13 +9,15 @@ from napari.components import ViewerModel
 from napari.layers import Image, Layer, Shapes, Tracks
 from numpy.typing import NDArray
 
+from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
 
 if TYPE_CHECKING:
-    from napari_fiberburst.results.reconstruction import Canvas, Reconstruction
+    from napari_fiberburst.data.canvas import Canvas
+    from napari_fiberburst.results.reconstruction import Reconstruction
 
 # Outlines are drawn anew at most this often, for a layer of shapes is slow to come and to change.
 _SECONDS_BETWEEN_OUTLINES = 5.0
@@ -120,13 +122,13 @@ class RunLayers:
         yield
         self._add("uncertainty", result.uncertainty, "YX", canvas, colormap="magma")
         yield
-        if result.transmission is not None:
-            is_colour = self.placement.rgb and result.transmission.ndim == 3
-            light = np.clip(result.transmission, 0, 1) if is_colour else result.transmission
-            self._add("transmission", light, "YX" if is_colour else "YXC"[: light.ndim], rgb=is_colour)
-            yield
-        if result.residuals is not None and result.cores is not None and np.isfinite(result.residuals).any():
-            maps = residual_maps(result.residuals, result.cores, shape)
+        bundle = result.bundle
+        if bundle is None:
+            return
+        self._add("transmission", bundle.transmission, "YX")
+        yield
+        if result.residuals is not None and bundle.is_resolved and np.isfinite(result.residuals).any():
+            maps = residual_maps(result.residuals, bundle.labels)
             high = float(np.nanpercentile(result.residuals, _RESIDUAL_PERCENTILE))
             self._add("residuals", maps, "TYX", colormap="inferno", contrast_limits=(0.0, high or 1.0))
 
@@ -193,8 +195,7 @@ class RunLayers:
     def _vertices(
         self, homography: NDArray[np.float64], points: NDArray[np.float64], frame: int
     ) -> list[NDArray[np.float64]]:
-        mapped = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ homography.T
-        return self.placement.vertices(mapped[:, :2] / mapped[:, 2:], frame)
+        return self.placement.vertices(transform_points(homography, points), frame)
 
     def _put_frames(self, homographies: NDArray[np.float64], shape: tuple[int, int]) -> Iterator[None]:
         """Add or change the outlines, then the track; yields after each."""

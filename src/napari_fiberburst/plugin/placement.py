@@ -9,7 +9,7 @@ from napari.layers import Image
 from numpy.typing import NDArray
 
 from napari_fiberburst.data.burst import Acquisition
-from napari_fiberburst.results.reconstruction import Canvas
+from napari_fiberburst.data.canvas import Canvas
 
 # Parts of a picture's values that are let go below and above when its contrast is set.
 _DARKEST, _BRIGHTEST = 0.1, 99.9

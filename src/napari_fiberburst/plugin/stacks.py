@@ -7,11 +7,11 @@ import numpy as np
 from dask.delayed import delayed
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.spatial import cKDTree
+
+from napari_fiberburst.coordinates import transform_points
 
 if TYPE_CHECKING:
-    from napari_fiberburst.results.diagnostics import Cores
-    from napari_fiberburst.results.reconstruction import Canvas
+    from napari_fiberburst.data.canvas import Canvas
 
 
 def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas") -> da.Array:
@@ -39,14 +39,17 @@ def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas")
     return da.stack(moved)
 
 
-def residual_maps(residuals: NDArray[np.float32], cores: "Cores", shape: tuple[int, int]) -> da.Array:
-    """Return by how much the model misses each core in each frame, as pictures (T, H, W); NaN between cores."""
-    rows, columns = np.indices(shape)
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    distance, nearest = cKDTree(cores.centres).query(pixels, distance_upper_bound=cores.pitch)
-    inside = np.isfinite(distance).reshape(shape)
-    nearest = np.where(inside, nearest.reshape(shape), 0)
-    maps = [da.from_delayed(delayed(_paint)(frame, nearest, inside), shape, np.float32) for frame in residuals]
+def residual_maps(residuals: NDArray[np.float32], labels: NDArray[np.int32]) -> da.Array:
+    """Return by how much the model misses each core in each frame, as pictures (T, H, W); NaN outside all cores.
+
+    Parameters
+    ----------
+    residuals : numpy.ndarray
+        (T, N), a value a core and frame.
+    labels : numpy.ndarray
+        (H, W), the core of each pixel; N where none.
+    """
+    maps = [da.from_delayed(delayed(_paint)(frame, labels), labels.shape, np.float32) for frame in residuals]
     return da.stack(maps)
 
 
@@ -56,12 +59,11 @@ def _move(frame: Any, homography: NDArray[np.float64], canvas: "Canvas") -> NDAr
     if not np.isfinite(homography).all():
         return np.zeros(shape, frame.dtype)
     points = canvas.points()
-    mapped = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ np.linalg.inv(homography).T
-    at = (mapped[..., :2] / mapped[..., 2:])[..., ::-1].transpose(2, 0, 1)
+    at = transform_points(np.linalg.inv(homography), points)[..., ::-1].transpose(2, 0, 1)
     channels = frame.reshape(*frame.shape[:2], -1)
     moved = [map_coordinates(channel, at, order=1, output=frame.dtype) for channel in channels.transpose(2, 0, 1)]
     return np.stack(moved, axis=-1).reshape(shape)
 
 
-def _paint(values: NDArray[np.float32], nearest: NDArray[np.intp], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    return np.where(inside, values[nearest], np.nan).astype(np.float32)
+def _paint(values: NDArray[np.float32], labels: NDArray[np.int32]) -> NDArray[np.float32]:
+    return np.append(values, np.float32(np.nan))[labels]

@@ -6,37 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Cores:
-    """The cores of a bundle, as a burst calibrated them.
-
-    Attributes
-    ----------
-    centres : numpy.ndarray
-        (N, 2) float64 as (x, y), frame pixels.
-    gains : numpy.ndarray
-        (N,) how much light each passes, as a part of a bright core's.
-    radius : float
-        Of the area over which a core gathers light, pixels.
-    pitch : float
-        Distance of neighbouring cores, pixels.
-    saturated : numpy.ndarray
-        (N,) bool, cores that were too bright for the camera in most frames.
-    dead : numpy.ndarray
-        (M, 2) float64, places in the lattice without light.
-    """
-
-    centres: NDArray[np.float64]
-    gains: NDArray[np.float64]
-    radius: float
-    pitch: float
-    saturated: NDArray[np.bool_]
-    dead: NDArray[np.float64]
+from napari_fiberburst.bundle.bundle import Bundle
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Evidence:
+class Diagnostics:
     """What is known of a reconstruction beside its picture; None where the method does not tell.
 
     Attributes
@@ -47,10 +21,14 @@ class Evidence:
     uncertainty : numpy.ndarray or None
         (H, W) float32 on the canvas, the standard deviation to be expected of the picture, intensity units, averaged
         over the channels. It holds what noise and gaps do, not what a wrong model does.
-    transmission : numpy.ndarray or None
-        (H, W) or (H, W, C) float32, the part of the light that each frame pixel passes, 1 for a bright core.
-    cores : Cores or None
-        The bundle's cores; None where none can be told apart.
+    bundle : Bundle or None
+        The bundle as this burst shows it: where it is in these frames, with gains as they were taken out. It can be
+        kept, and serves other bursts through the same probe.
+    gain_ratios : numpy.ndarray or None
+        (N,) float32, the gain of each core as the finished scene shows it, relative to the bundle's; 1 where nothing
+        was seen. `Bundle.updated` takes it in.
+    gain_weights : numpy.ndarray or None
+        (N,) float32, how much light each of these ratios rests on: squares of full scale, added over frames.
     residuals : numpy.ndarray or None
         (T, N) float32, root mean square by which the model misses each core in each frame, intensity units; NaN
         where there is no sample.
@@ -70,8 +48,9 @@ class Evidence:
 
     coverage: NDArray[np.float32] | None = None
     uncertainty: NDArray[np.float32] | None = None
-    transmission: NDArray[np.float32] | None = None
-    cores: Cores | None = None
+    bundle: Bundle | None = None
+    gain_ratios: NDArray[np.float32] | None = None
+    gain_weights: NDArray[np.float32] | None = None
     residuals: NDArray[np.float32] | None = None
     sample_error: float | None = None
     frames_used: tuple[int, ...] | None = None
@@ -82,7 +61,7 @@ class Evidence:
 
     def summary(self) -> dict[str, Any]:
         """Return what is not a picture, as plain values that JSON can hold."""
-        cores = self.cores
+        bundle = self.bundle
         return {
             "sample_error": self.sample_error,
             "frames_used": self.frames_used,
@@ -93,16 +72,18 @@ class Evidence:
             "resolution": self.resolution,
             "notes": self.notes,
             "bundle": None
-            if cores is None
+            if bundle is None
             else {
-                "pitch": cores.pitch,
-                "cores": len(cores.centres),
-                "dead": len(cores.dead),
-                "saturated": int(cores.saturated.sum()),
-                "footprint_radius": cores.radius,
+                "pattern": bundle.pattern,
+                "pitch": bundle.pitch,
+                "cores": len(bundle.centres),
+                "dead": len(bundle.dead),
+                "saturated": int(bundle.saturated.sum()),
+                "footprint_radius": bundle.radius,
+                **bundle.provenance,
             },
         }
 
-    def evidence(self) -> dict[str, Any]:
-        """Return the evidence alone, by name."""
-        return {item.name: getattr(self, item.name) for item in fields(Evidence)}
+    def by_name(self) -> dict[str, Any]:
+        """Return the diagnostics alone, by name."""
+        return {item.name: getattr(self, item.name) for item in fields(Diagnostics)}

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter
 from torch import Tensor
 
+from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.operators.grid import Grid
 
 # What the spline takes the scene for beyond its nodes; nothing is drawn there.
 _BEYOND: Final = "mirror"
 
 
-class SplinePicture:
+class SplineImage:
     """A scene on a grid, and how frames look at it.
 
     Parameters
@@ -48,7 +49,6 @@ class SplinePicture:
         black: float,
     ) -> None:
         self.scene, self.grid = scene, grid
-        self.is_shown = False
         self._known, self._reach, self._fill = known, reach, fill
         self.homographies, self.black = homographies, black
         self._far: Tensor | None = None
@@ -106,7 +106,7 @@ class SplinePicture:
         }
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, NDArray[Any]], device: torch.device) -> "SplinePicture":
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]], device: torch.device) -> "SplineImage":
         """Rebuild a picture from `arrays`."""
         x0, y0, spacing = arrays["nodes"].tolist()
         reach, fill, black = arrays["drawing"].tolist()
@@ -122,10 +122,7 @@ class SplinePicture:
         )
 
     def _mapped(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        matrix = self.homographies[frame]
-        mapped = points @ matrix[:, :2].T + matrix[:, 2]
-        result: NDArray[np.float64] = mapped[..., :2] / mapped[..., 2:]
-        return result
+        return transform_points(self.homographies[frame], points)
 
     def _distance(self) -> Tensor:
         """Return how far each node is from what is known, pixels (H, W)."""

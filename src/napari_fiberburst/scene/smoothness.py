@@ -8,10 +8,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.bundle.samples import Observation
+from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.grid import Grid, blur
 from napari_fiberburst.quality.resolution import ring_correlation
-from napari_fiberburst.scene.spline import Normal
+from napari_fiberburst.scene.spline import NormalEquations
 
 # Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
 _CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
@@ -43,7 +43,7 @@ class Smoothness:
 
 
 def choose_smoothness(
-    observation: Observation, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
+    samples: Samples, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
 ) -> Smoothness:
     """Choose the smoothness by which each half of the burst best predicts the scene of the other.
 
@@ -53,7 +53,7 @@ def choose_smoothness(
 
     Parameters
     ----------
-    observation, points
+    samples, points
         What is seen, and where (T, N, 2).
     frames : numpy.ndarray
         Numbers of the frames that take part, at least two.
@@ -63,12 +63,12 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = _window(grid, scene)
-    grey = observation.values.mean(dim=2, keepdim=True)
+    grey = samples.values.mean(dim=2, keepdim=True)
     halves = []
     for chosen in (frames[::2], frames[1::2]):
-        normal = Normal(window, observation.radius, 1, points.device)
+        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
         for number in chosen:
-            normal.add(points[number], grey[number], observation.weights[number])
+            normal = normal.with_samples(points[number], grey[number], samples.weights[number])
         halves.append(normal)
     densities = [blur(half.density(), 3.0) for half in halves]
     both = torch.minimum(*densities)
@@ -76,10 +76,7 @@ def choose_smoothness(
     if not bool(seen.any()):
         return Smoothness(UNTOLD, None)
     paths = [
-        [
-            half.picture(scene, smoothness)
-            for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)
-        ]
+        [half.image(scene, smoothness) for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)]
         for half in halves
     ]
     reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
@@ -95,7 +92,7 @@ def choose_smoothness(
 
 
 def choose_among_neighbours(
-    observation: Observation, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
+    samples: Samples, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
 ) -> Smoothness:
     """Choose the smoothness by which each core is best predicted from those around it.
 
@@ -106,24 +103,24 @@ def choose_among_neighbours(
     Parameters are those of `choose_smoothness`; one frame is enough.
     """
     window = _window(grid, scene)
-    grey = observation.values.mean(dim=2, keepdim=True)
+    grey = samples.values.mean(dim=2, keepdim=True)
     fold = torch.randperm(grey.shape[1], generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
     risks = np.zeros(len(_STILL_CANDIDATES))
     for left in range(_FOLDS):
-        normal = Normal(window, observation.radius, 1, points.device)
+        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
         for number in frames:
-            normal.add(points[number], grey[number], observation.weights[number] * (fold != left))
+            normal = normal.with_samples(points[number], grey[number], samples.weights[number] * (fold != left))
         for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
             shown = normal.through(guess)[0]
             for number in frames:
-                asked = (fold == left) & (observation.weights[number] > 0)
+                asked = (fold == left) & (samples.weights[number] > 0)
                 at = window.at(points[number, asked])
-                weights = observation.weights[number, asked] * at.inside
+                weights = samples.weights[number, asked] * at.inside
                 risks[index] += float((weights * (grey[number, asked, 0] - at.read(shown)) ** 2).sum())
     return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
 
 
-def _path(normal: Normal, candidates: tuple[float, ...]) -> list[Tensor]:
+def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor]:
     """Return the scenes of all candidates, each started from the smoother one before."""
     scene = normal.mean()
     scenes = []

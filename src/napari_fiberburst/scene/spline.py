@@ -12,16 +12,17 @@ Points take the membrane prior, of slopes; footprints the thin plate's, of curva
 detail that is there, which undoing a blur needs.
 
 Between its nodes a linear spline falls short of a smooth picture, so one that fits samples everywhere overshoots at
-the nodes, by a fifth at a period of four. `Normal.picture` takes that out.
+the nodes, by a fifth at a period of four. `NormalEquations.image` takes that out.
 """
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from napari_fiberburst.bundle.samples import Observation
+from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid, Stencil, blur, roughness
 
@@ -33,35 +34,60 @@ _LEAST_DENSITY = 0.05
 _RIM = 8
 
 
-class Normal:
-    """The normal equations of an observation on a grid.
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """The normal equations of samples on a grid.
 
-    Parameters
+    Attributes
     ----------
     grid : Grid
         Where the scene's nodes are.
     radius : float or None
-        Footprint of the sensors, pixels.
-    channels : int
-        C.
-    device : torch.device
-        Where.
+        Footprint of the samples, pixels; None for points.
+    bands : Tensor
+        (5, H, W), S^T W S as a `Stencil`.
+    rhs : Tensor
+        (C, H, W), S^T W v.
     """
 
-    def __init__(self, grid: Grid, radius: float | None, channels: int, device: torch.device) -> None:
-        self.grid = grid
-        self.footprint = None if radius is None else Footprint(grid, radius)
-        self._order = 1 if radius is None else 2
-        self.stencil = Stencil(torch.zeros(5, *grid.shape, device=device))
-        self.light = torch.zeros(channels, *grid.shape, device=device)
+    grid: Grid
+    radius: float | None
+    bands: Tensor
+    rhs: Tensor
 
-    def add(self, points: Tensor, values: Tensor, weights: Tensor) -> None:
-        """Add samples at points (N, 2) of values (N, C) and weights (N,)."""
+    @classmethod
+    def empty(cls, grid: Grid, radius: float | None, channels: int, device: torch.device) -> "NormalEquations":
+        """Return the equations of no samples."""
+        return cls(
+            grid, radius, torch.zeros(5, *grid.shape, device=device), torch.zeros(channels, *grid.shape, device=device)
+        )
+
+    def with_samples(self, points: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
+        """Return the equations with samples at points (N, 2) of values (N, C) and weights (N,)."""
         used = weights > 0
         at, values, weights = self.grid.at(points[used]), values[used], weights[used]
-        self.stencil = self.stencil + at.normal(weights)
-        for channel, light in zip(values.T, self.light, strict=True):
-            light += at.write(channel * weights)
+        rhs = torch.stack(
+            [light + at.write(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
+        )
+        return replace(self, bands=self.bands + at.normal(weights).bands, rhs=rhs)
+
+    def __add__(self, other: "NormalEquations") -> "NormalEquations":
+        return replace(self, bands=self.bands + other.bands, rhs=self.rhs + other.rhs)
+
+    @property
+    def stencil(self) -> Stencil:
+        """S^T W S."""
+        return Stencil(self.bands)
+
+    @property
+    def footprint(self) -> Footprint | None:
+        """B, the footprint of the samples; None for points."""
+        return None if self.radius is None else Footprint.cached(self.grid, self.radius, self.rhs.device)
+
+    @property
+    def _order(self) -> int:
+        """Of the derivatives that the prior holds down."""
+        return 1 if self.radius is None else 2
 
     def through(self, scene: Tensor) -> Tensor:
         """Return the scene (..., H, W) as sensors see it, by their footprint."""
@@ -84,7 +110,7 @@ class Normal:
         if self.footprint is not None:
             diagonal = blur(diagonal, 1.0).clamp_min(0)
         inverse = 1 / (diagonal + weight * (4 if self._order == 1 else 20) + 1e-9)
-        right = self.through(self.light)
+        right = self.through(self.rhs)
         scene = start
         residual = right - self._multiply(scene, weight)
         search = inverse * residual
@@ -102,7 +128,7 @@ class Normal:
             search = ready + power / before.clamp_min(1e-30) * search
         return scene
 
-    def picture(self, scene: Tensor, smoothness: float) -> Tensor:
+    def image(self, scene: Tensor, smoothness: float) -> Tensor:
         """Return the smooth picture that a solution (C, H, W) stands for, at the nodes.
 
         Reading a wave of frequency f by linear interpolation at the distance d from a node, as a part of the spacing,
@@ -137,7 +163,7 @@ class Normal:
     def mean(self) -> Tensor:
         """Return an even scene of the right brightness, (C, H, W)."""
         mass = self.stencil.bands[0].sum() + 2 * self.stencil.bands[1:].sum()
-        level = self.light.sum(dim=(1, 2)) / mass.clamp_min(1e-12)
+        level = self.rhs.sum(dim=(1, 2)) / mass.clamp_min(1e-12)
         return level[:, None, None].expand(-1, *self.grid.shape).clone()
 
     def density(self) -> Tensor:
@@ -158,7 +184,7 @@ class Normal:
         table = (variance / (densities[:, None, None] * transfer + prior)).mean(dim=(1, 2))
         density = blur(self.density(), reach / self.grid.spacing).clamp(1e-4, 1e3).cpu()
         deviation = np.interp(density.log10().numpy(), densities.log10().numpy(), table.sqrt().clamp(max=most).numpy())
-        return torch.from_numpy(deviation).to(self.light)
+        return torch.from_numpy(deviation).to(self.rhs)
 
     def _weight(self, smoothness: float) -> float:
         """Return the prior's weight for nodes that are not a pixel apart."""
@@ -190,14 +216,14 @@ def _read_gain(frequency: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
     return square, 1 - 6 * spread * (1 - torch.sinc(frequency) ** 2)
 
 
-def assemble(grid: Grid, observation: Observation, points: Tensor, among: Tensor | None = None) -> Normal:
-    """Return the normal equations of an observation whose sensors are at points (T, N, 2) of the scene.
+def assemble(grid: Grid, samples: Samples, points: Tensor, among: Tensor | None = None) -> NormalEquations:
+    """Return the normal equations of samples at points (T, N, 2) of the scene.
 
     `among` (T, N) multiplies the weights: 0 leaves samples out.
     """
-    normal = Normal(grid, observation.radius, observation.values.shape[2], points.device)
-    for number, weights in enumerate(observation.weights):
+    equations = NormalEquations.empty(grid, samples.radius, samples.values.shape[2], points.device)
+    for number, weights in enumerate(samples.weights):
         if bool((weights > 0).any()):
             chosen = weights if among is None else weights * among[number]
-            normal.add(points[number], observation.values[number], chosen)
-    return normal
+            equations = equations.with_samples(points[number], samples.values[number], chosen)
+    return equations

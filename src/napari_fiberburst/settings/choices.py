@@ -92,6 +92,7 @@ class NoMotion:
     """No motion: the object stands still; without a bundle model, a network memorises f(x, y, t)."""
 
     name: ClassVar[str] = "none"
+    dof: ClassVar[int] = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,6 +100,7 @@ class Translation:
     """One shift per frame."""
 
     name: ClassVar[str] = "translation"
+    dof: ClassVar[int] = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +108,7 @@ class Similarity:
     """One shift, turn and scale per frame."""
 
     name: ClassVar[str] = "similarity"
+    dof: ClassVar[int] = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,6 +116,7 @@ class Affine:
     """One affine transform per frame: shift, turn, scale and shear."""
 
     name: ClassVar[str] = "affine"
+    dof: ClassVar[int] = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,10 +124,13 @@ class Homography:
     """One homography per frame: a flat object, seen from anywhere."""
 
     name: ClassVar[str] = "homography"
+    dof: ClassVar[int] = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _MotionNetwork:
+    # Behind a bundle the frames are registered by homographies before the network refines them.
+    dof: ClassVar[int] = 8
     motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1, most=64)
     motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napari_fiberburst.data.burst import MIN_FRAMES, MIN_SIDE, Burst
+from napari_fiberburst.data.burst import MIN_SIDE, Burst
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.simulation.bundle import Bundle, make_bundle
 from napari_fiberburst.simulation.camera import Camera
@@ -177,7 +177,7 @@ def _motion(
 
 
 def _check_numbers(shape: tuple[int, int], frames: int, channels: int | None, seed: int) -> None:
-    wanted = {"frames": (frames, MIN_FRAMES), "channels": (1 if channels is None else channels, 1), "seed": (seed, 0)}
+    wanted = {"frames": (frames, 1), "channels": (1 if channels is None else channels, 1), "seed": (seed, 0)}
     if len(shape) != 2:
         raise SettingsError(f"shape must be (height, width); got {shape}")
     for name, (value, least) in {**wanted, "height": (shape[0], MIN_SIDE), "width": (shape[1], MIN_SIDE)}.items():

@@ -1,23 +1,25 @@
 """One fit in the making: the joint field, the samples it is fitted to, and Adam."""
 
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import unit_from_pixel
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.networks.batches import Batch, Samples
+from napari_fiberburst.networks.batches import Batch, BundleStream, PixelStream
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.motion import AlignedField
 from napari_fiberburst.networks.scene import PUBLISHED_SIGMA
-from napari_fiberburst.pipeline.alignment import Alignment
-from napari_fiberburst.pipeline.observed import ObservedSamples
 from napari_fiberburst.results.reconstruction import Reconstruction
+from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import Hash, Settings
 
 # As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
@@ -35,6 +37,22 @@ _IDENTITY = ("shape", "axes", "dtype", "black_level", "white_level", "origin")
 State = tuple[dict[str, Any], dict[str, Any], int]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class BehindBundle:
+    """What a network is fitted to behind a calibrated bundle.
+
+    Attributes
+    ----------
+    samples : Samples
+        Gains taken out.
+    homographies : numpy.ndarray
+        (T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are left out.
+    """
+
+    samples: Samples
+    homographies: NDArray[np.float64]
+
+
 class Problem:
     """Minimise the mean of |I_hat - I|^2 over the samples, plus the motion's prior where it has one.
 
@@ -48,8 +66,8 @@ class Problem:
         Where.
     initial : Reconstruction, optional
         Where to go on from; the samples go on from where its run ended, too.
-    aligned : Alignment, optional
-        The burst, calibrated and registered; without, its frames are fitted as they are, as published.
+    behind : BehindBundle, optional
+        The samples of the bundle and where they lie; without, the frames are fitted as they are, as published.
 
     Raises
     ------
@@ -65,20 +83,20 @@ class Problem:
         settings: Settings,
         device: torch.device,
         initial: Reconstruction | None = None,
-        aligned: Alignment | None = None,
+        behind: "BehindBundle | None" = None,
     ) -> None:
-        count, height, width, channels = burst.shape
+        _, height, width, _ = burst.shape
         self.frame_shape = (height, width)
-        self.samples: Samples | ObservedSamples
+        self.samples: PixelStream | BundleStream
         start = None
-        if aligned is None:
-            self.samples = Samples(burst, device, settings.seed)
+        if behind is None:
+            self.samples = PixelStream(burst, device, settings.seed)
             self.batch = settings.batch or -(-height * width // BATCHES_PER_FRAME)
         else:
-            self.samples = ObservedSamples(aligned, settings.held_out, settings.seed)
+            self.samples = BundleStream(behind.samples, settings.held_out, settings.seed)
             self.batch = min(settings.batch or -(-height * width // BATCHES_PER_FRAME), self.samples.count)
-            start = _unit_start(aligned)
-        self.field = JointField(settings, count, channels, start).to(device)
+            start = _unit_start(behind)
+        self.field = JointField(settings, burst.shape, start).to(device)
         self.learning_rate = settings.learning_rate or _usual_rate(settings)
         registered = isinstance(self.field.motion, AlignedField)
         self._paces = (1.0, _PACE_OF_REGISTERED_MOTION if registered else 1.0)
@@ -105,7 +123,7 @@ class Problem:
 
     def sample_error(self) -> float | None:
         """Return the root mean square error, intensities in [0, 1], of samples that were left out; None without any."""
-        left_out = self.samples.left_out() if isinstance(self.samples, ObservedSamples) else None
+        left_out = self.samples.left_out() if isinstance(self.samples, BundleStream) else None
         if left_out is None:
             return None
         with torch.no_grad():
@@ -150,10 +168,10 @@ class Problem:
         self.optimizer.load_state_dict(optimizer)
         self.samples.drawn = drawn
 
-    def representation(self) -> Representation:
-        """Return the state as it is now, to draw or to go on from."""
+    def representation(self, behind: SplineImage | None = None) -> Representation:
+        """Return the state as it is now, to draw or to go on from; `behind` is the first image behind the bundle."""
         state: dict[str, Any] = self.optimizer.state_dict()
-        return Representation(self.field, self.frame_shape, state, self.samples.drawn)
+        return Representation(self.field, self.frame_shape, state, self.samples.drawn, behind)
 
     def _go_on_from(self, initial: Reconstruction, burst: Burst, settings: Settings) -> None:
         start = initial.renderer
@@ -176,11 +194,11 @@ class Problem:
         self.samples.drawn = start.drawn
 
 
-def _unit_start(aligned: Alignment) -> Tensor:
+def _unit_start(behind: BehindBundle) -> Tensor:
     """Return where registration has put each frame, (T, 3, 3) in unit coordinates; the identity for unused frames."""
-    to_unit = unit_from_pixel(aligned.shape)
-    matrices = np.nan_to_num(aligned.homographies())
-    matrices[~aligned.used] = np.eye(3)
+    to_unit = unit_from_pixel(behind.samples.shape)
+    matrices = behind.homographies.copy()
+    matrices[~np.isfinite(matrices).all(axis=(1, 2))] = np.eye(3)
     return torch.from_numpy((to_unit @ matrices @ np.linalg.inv(to_unit)).astype(np.float32))
 
 

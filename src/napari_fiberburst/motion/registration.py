@@ -1,0 +1,372 @@
+"""Step 2: register the frames of a burst by its samples, from a coarse search to hundredths of a pixel."""
+
+import logging
+from collections.abc import Generator
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.coordinates import relative_to, transform_points
+from napari_fiberburst.motion.coarse import LEAST_CONFIDENCE, confidence, find_shifts
+from napari_fiberburst.motion.joint import COARSE, ENOUGH, FINE_CORES, FINE_PIXELS, FINER, Groupwise, Level
+from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.steps import drain
+from napari_fiberburst.stored import Stored
+
+logger = logging.getLogger(__name__)
+
+# The motion has a handful of unknowns a frame, so this many samples of it are plenty,
+_MOST_SAMPLES = 500_000
+# and the first rounds, which only bring rotation and perspective into reach, need fewer.
+_COARSE_SAMPLES = 60_000
+# Root mean square over the corners, in pitches: frames that move less do not fill the gaps between cores.
+_LEAST_MOTION = 0.25
+# A frame that agrees with the others less than this part of the median frame is left out.
+_LEAST_OF_USUAL = 0.6
+# A frame whose area grows or shrinks by more than this factor, or that leaves by more than its own size, is lost.
+_MOST_SWELLING = 3.0
+# Of full scale: the mean light that values are divided by, at least.
+_LEAST_LIGHT = 1e-4
+
+Stage = Literal["none", "shifts", "coarse", "fine", "complete"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GreyScene:
+    """The scene as registration sees it, in grey.
+
+    Attributes
+    ----------
+    grid : Grid
+        Its nodes, in scene pixels.
+    nodes : Tensor
+        (H, W), relative to `light`.
+    light : float
+        The mean light of the samples, full scale 1.
+    """
+
+    grid: Grid
+    nodes: Tensor
+    light: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registration(Stored):
+    """Where every frame of a burst looks, and how far to trust it.
+
+    Attributes
+    ----------
+    scene_from_frame : numpy.ndarray
+        (T, 3, 3) float64, frame-t pixel (x, y) to scene pixel.
+    used : numpy.ndarray
+        (T,) bool, frames that take part. The others could not be registered.
+    confidence : numpy.ndarray
+        (T,) 0 to 1, how well each frame agrees with the others where they overlap; NaN while that is not known.
+    frame_weights : numpy.ndarray
+        (T,) 0 to 1, how much each frame counts: blurred ones fit worse, and count less.
+    gains : numpy.ndarray
+        (G,) float32, gain of each core relative to what the samples assume; 1 where none was looked for.
+    residual : float
+        Root of the weighted mean square of what the model leaves of the samples, full scale 1; NaN before the first
+        round.
+    is_still : bool
+        Whether the object moves too little to fill the gaps between cores.
+    stage : str
+        How far it has come: "none", "shifts", "coarse", "fine" (shear and perspective too), or "complete".
+    rounds : int
+        Gauss-Newton rounds done.
+    notes : tuple of str
+        What a user should know.
+    scene : GreyScene or None
+        The scene that the frames were registered to.
+    """
+
+    _kind: ClassVar[str] = "registration"
+
+    scene_from_frame: NDArray[np.float64]
+    used: NDArray[np.bool_]
+    confidence: NDArray[np.float64]
+    frame_weights: NDArray[np.float32]
+    gains: NDArray[np.float32]
+    residual: float = float("nan")
+    is_still: bool = False
+    stage: Stage = "none"
+    rounds: int = 0
+    notes: tuple[str, ...] = ()
+    scene: GreyScene | None = field(default=None, repr=False)
+
+    @classmethod
+    def known(cls, scene_from_frame: NDArray[np.float64], cores: int) -> "Registration":
+        """Return a registration for motion (T, 3, 3) that is known, such as a simulation's."""
+        count = len(scene_from_frame)
+        return cls(
+            scene_from_frame=np.array(scene_from_frame, dtype=np.float64),
+            used=np.ones(count, dtype=bool),
+            confidence=np.ones(count),
+            frame_weights=np.ones(count, np.float32),
+            gains=np.ones(cores, np.float32),
+            stage="complete",
+        )
+
+    @property
+    def reference(self) -> int:
+        """The first frame that takes part: images and homographies are in its pixels."""
+        return int(np.flatnonzero(self.used)[0])
+
+    @property
+    def reference_from_frame(self) -> NDArray[np.float64]:
+        """(T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are left out."""
+        relative = relative_to(self.scene_from_frame, self.reference)
+        relative[~self.used] = np.nan
+        return relative
+
+    def points(self, positions: Tensor) -> Tensor:
+        """Return where places (N, 2) of every frame lie in the reference frame's pixels, (T, N, 2); NaN if left out."""
+        points: Tensor = transform_points(torch.from_numpy(self.reference_from_frame).to(positions), positions)
+        return points
+
+    def predicted(self, number: int, pixels: Tensor) -> Tensor:
+        """Return the grey light of the scene at pixels (N, 2) of frame `number`, full scale 1; 0 where unknown."""
+        if self.scene is None or not self.used[number]:
+            return torch.zeros(len(pixels)).to(pixels)
+        matrix = torch.from_numpy(self.scene_from_frame[number]).to(pixels)
+        at = self.scene.grid.at(transform_points(matrix, pixels))
+        return at.read(self.scene.nodes) * self.scene.light
+
+
+def register(samples: Samples, *, dof: int = 8, rounds: int | None = None, seed: int = 0) -> Registration:
+    """Find how every frame lies on the scene.
+
+    Parameters
+    ----------
+    samples : Samples
+        Of whole cores, grey or in colour.
+    dof : int
+        Degrees of freedom of each frame's motion: 2 for a translation, 4 for a similarity, 6 for an affine transform, 8
+        for a homography; 0 where the frames are known not to move.
+    rounds : int, optional
+        Gauss-Newton rounds at most.
+    seed : int
+        The first rounds use some of the samples, drawn by this seed.
+
+    Returns
+    -------
+    Registration
+        Frames that do not belong are marked in `used`, and named in `notes`.
+    """
+    return drain(registering(samples, dof=dof, rounds=rounds, seed=seed))
+
+
+def unregistered(samples: Samples) -> Registration:
+    """Return the registration before anything is known: all frames lie on one another."""
+    count = len(samples.values)
+    return Registration(
+        scene_from_frame=np.tile(np.eye(3), (count, 1, 1)),
+        used=np.ones(count, dtype=bool),
+        confidence=np.full(count, np.nan),
+        frame_weights=np.ones(count, np.float32),
+        gains=np.ones(samples.cores, np.float32),
+    )
+
+
+def registering(
+    samples: Samples, *, dof: int, rounds: int | None, seed: int
+) -> Generator[Registration, None, Registration]:
+    """Register as `register` does; yields what is known after each round."""
+    start = unregistered(samples)
+    if len(samples.values) < 2:
+        return _alone(start, samples)
+    if dof == 0:
+        judged = _judged(start, samples)
+        return _still(judged) if judged.used.sum() > 1 else _alone(judged, samples)
+    shifts = find_shifts(samples.positions, samples.grey, samples.weights, samples.shape, samples.pitch)
+    found = replace(
+        start,
+        used=shifts.connected,
+        confidence=shifts.confidence,
+        frame_weights=shifts.connected.astype(np.float32),
+        stage="shifts",
+    )
+    moved = shifts.shifts - shifts.shifts[found.reference]
+    moved[~found.used] = 0
+    found.scene_from_frame[:, :2, 2] = moved
+    yield found
+    if found.used.sum() < 2:
+        return _alone(found, samples)
+    search = _Search(samples, dof, moved, np.inf if rounds is None else rounds, seed)
+    found = yield from search.refine(replace(found, stage="coarse"), (COARSE,), None, _COARSE_SAMPLES)
+    found = replace(found, stage="fine")
+    yield found
+    found = yield from search.refine(found, FINER, None, None)
+    found = _judged(found, samples)
+    if found.used.sum() < 2:
+        return _alone(found, samples)
+    return _still(found) if found.is_still else replace(found, stage="complete")
+
+
+def refining(
+    samples: Samples, found: Registration, *, dof: int, rounds: int | None, seed: int
+) -> Generator[Registration, None, Registration]:
+    """Refine a registration, and find the gains, by the final samples of the bundle; yields after each round.
+
+    Parameters
+    ----------
+    samples : Samples
+        Of cores, with their footprint, or of pixels.
+    found : Registration
+        By `register`; its frames lie on the same scene.
+    dof, seed
+        As for `register`.
+    rounds : int, optional
+        Gauss-Newton rounds at most, those that `found` has had included.
+    """
+    if found.scene is None or found.is_still:
+        return found
+    left = np.inf if rounds is None else rounds - found.rounds
+    search = _Search(samples, dof, found.scene_from_frame[:, :2, 2].copy(), left, seed)
+    levels, most = (FINE_PIXELS, _MOST_SAMPLES) if samples.kind == "pixels" else (FINE_CORES, None)
+    return (yield from search.refine(found, levels, samples.radius, most))
+
+
+class _Search:
+    """Gauss-Newton rounds from where the frames lie."""
+
+    def __init__(self, samples: Samples, dof: int, shifts: NDArray[np.float64], rounds: float, seed: int) -> None:
+        self._samples, self._dof, self._shifts = samples, dof, shifts
+        self._left, self._seed = rounds, seed
+
+    def refine(
+        self, found: Registration, levels: tuple[Level, ...], radius: float | None, most: int | None
+    ) -> Generator[Registration, None, Registration]:
+        """Refine by at most so many samples, seen through a footprint of this radius; yields after each round."""
+        samples = self._samples.weighted(torch.from_numpy(found.used))
+        light = _light(samples) if found.scene is None else found.scene.light
+        group = self._group(samples, found, light, most)
+        for level in levels:
+            if self._left <= 0:
+                break
+            group.enter(level, radius)
+            for number in range(level.rounds):
+                before = group.motion.scene_from_frame.clone()
+                longest = group.round(level, number)
+                lost = group.motion.has_left(self._shifts, _MOST_SWELLING)
+                if lost.any():
+                    group.motion.scene_from_frame[torch.from_numpy(lost)] = before[torch.from_numpy(lost)]
+                    if (found.used & ~lost).any():
+                        found = replace(found, used=found.used & ~lost)
+                        group.weights = group.weights * torch.from_numpy(~lost).to(group.weights)[:, None]
+                self._left -= 1
+                found = self._state(found, group, light)
+                yield found
+                if self._left <= 0 or (longest < ENOUGH and number > 0):
+                    break
+            group.settle()
+        return replace(
+            self._state(found, group, light), rounds=found.rounds, frame_weights=_fit_weights(group, found.used)
+        )
+
+    def _group(self, samples: Samples, found: Registration, light: float, most: int | None) -> Groupwise:
+        """Return a joint registration of the samples, or of so many of them, from where the frames and scene are."""
+        device = samples.positions.device
+        chosen = torch.arange(len(samples.positions), device=device)
+        if most is not None:
+            wanted = max(1, most // int(found.used.sum()))
+            generator = torch.Generator().manual_seed(self._seed)
+            chosen = torch.randperm(len(samples.positions), generator=generator)[:wanted].sort().values.to(device)
+        motion = FrameMotion(len(found.used), samples.shape)
+        motion.scene_from_frame = torch.from_numpy(found.scene_from_frame.copy())
+        group = Groupwise(
+            samples.positions[chosen],
+            samples.values[:, chosen].mean(dim=2) / light,
+            samples.weights[:, chosen],
+            motion,
+            samples.pitch,
+            self._dof,
+            sources=samples.core_index[chosen] if samples.kind == "pixels" else None,
+            gains_fixed=samples.gains_known,
+        )
+        if found.scene is not None:
+            group.grid, group.scene = found.scene.grid, found.scene.nodes
+        return group
+
+    def _state(self, found: Registration, group: Groupwise, light: float) -> Registration:
+        """Return what is known now."""
+        gains = np.ones(self._samples.cores, np.float32)
+        gains[: len(group.gains)] = group.gains.cpu().numpy()
+        return replace(
+            found,
+            scene_from_frame=group.motion.scene_from_frame.numpy().copy(),
+            gains=gains if self._samples.kind == "pixels" or len(group.gains) == len(gains) else found.gains,
+            residual=group.residual * light,
+            rounds=found.rounds + 1,
+            scene=GreyScene(grid=group.grid, nodes=group.scene, light=light),
+        )
+
+
+def _light(samples: Samples) -> float:
+    """Return the mean light of the samples, full scale 1."""
+    mass = samples.weights.sum().clamp_min(1e-9)
+    return max(float((samples.grey * samples.weights).sum() / mass), _LEAST_LIGHT)
+
+
+def _fit_weights(group: Groupwise, used: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return how much each frame should count, (T,), by how well it fits the scene: a blurred one fits worse."""
+    left = (group.values - group.predicted()).square() * group.weights
+    error = (left.sum(dim=1) / group.weights.sum(dim=1).clamp_min(1e-9)).cpu().numpy()
+    usual = np.median(error[used])
+    fit: NDArray[np.float32] = (used * np.clip(usual / np.maximum(error, 1e-12), 0, 1)).astype(np.float32)
+    return fit
+
+
+def _judged(found: Registration, samples: Samples) -> Registration:
+    """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
+    samples = samples.weighted(torch.from_numpy(found.used))
+    motion = FrameMotion(len(found.used), samples.shape)
+    motion.scene_from_frame = torch.from_numpy(found.scene_from_frame)
+    values = samples.grey / torch.from_numpy(found.gains).to(samples.values)[samples.core_index]
+    agreement = confidence(samples.positions, values, samples.weights, motion, samples.pitch)
+    trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
+    used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))
+    judged = replace(found, used=used, confidence=trust, frame_weights=used.astype(np.float32))
+    if used.sum() < 2:
+        return judged
+    if not used.all():
+        left_out = ", ".join(str(number) for number in np.flatnonzero(~used))
+        judged = _noted(judged, f"frames that could not be registered are left out: {left_out}")
+    travel = _travel(judged.reference_from_frame[used], samples.shape)
+    return replace(judged, is_still=bool(travel < _LEAST_MOTION * samples.pitch))
+
+
+def _still(found: Registration) -> Registration:
+    """Return a registration whose frames all look at the same place."""
+    return replace(found, is_still=True, stage="complete", gains=np.ones_like(found.gains))
+
+
+def _alone(found: Registration, samples: Samples) -> Registration:
+    """Return a registration of one frame: that of median brightness, which is neither black nor over-exposed."""
+    if len(found.used) > 1:
+        found = _noted(
+            found, "the frames could not be registered to one another; the picture is made of one of them alone"
+        )
+    brightness = samples.grey.mean(dim=1).cpu().numpy()
+    used = np.arange(len(found.used)) == int(np.argsort(brightness)[len(brightness) // 2])
+    return _still(replace(found, used=used, frame_weights=used.astype(np.float32)))
+
+
+def _travel(homographies: NDArray[np.float64], shape: tuple[int, int]) -> float:
+    """Return how far the frames' corners lie from where they are on average, root mean square, pixels."""
+    height, width = shape
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]], dtype=np.float64)
+    places = transform_points(homographies, corners)
+    return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=2).mean()))
+
+
+def _noted(found: Registration, text: str) -> Registration:
+    logger.warning(text)
+    return replace(found, notes=(*found.notes, text))

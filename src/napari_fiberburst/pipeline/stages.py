@@ -1,0 +1,325 @@
+"""The steps of the method as one flow of values: calibrate, sample, register, refine, solve.
+
+Every function here is a generator that yields what is known so far and returns its last value, so that whoever drains
+it can stop between any two steps and still have something to draw.
+"""
+
+import logging
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
+from napari_fiberburst.bundle.placement import find_bundle
+from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
+from napari_fiberburst.bundle.transmission import remeasure, with_gains
+from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.errors import BurstError
+from napari_fiberburst.motion.registration import Registration, refining, registering, unregistered
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.scene.solve import Scene, solve_quickly, solving
+from napari_fiberburst.settings import Settings, Spline
+
+logger = logging.getLogger(__name__)
+
+# Spacing of the first preview's nodes, pixels or, in coarse bundles, pitches.
+_PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
+# A union of frames reaches at most so many frames' sizes from the reference frame.
+_MOST_FIELDS = 5
+# Nodes with less than this weight of samples have been seen by none.
+_LEAST_DENSITY = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Fitted:
+    """What is known of a burst at one moment of its fit.
+
+    Attributes
+    ----------
+    bundle : Bundle
+        With the gains that have been found so far.
+    registration : Registration
+        Of the frames.
+    canvas : Canvas
+        Where the picture lies.
+    samples : Samples or None
+        The final samples, in all channels, gains taken out; None until it is known what a sample is.
+    scene : Scene or None
+        The latest solution.
+    image : SplineImage or None
+        The latest picture; it knows by itself how the frames lay when it was made.
+    notes : tuple of str
+        What a user should know, beside the notes of the registration.
+    """
+
+    bundle: Bundle
+    registration: Registration
+    canvas: Canvas
+    samples: Samples | None = None
+    scene: Scene | None = None
+    image: SplineImage | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """All that a user should know before trusting the picture."""
+        return (*self.notes, *self.registration.notes)
+
+
+class Stages:
+    """The steps for one burst and its settings.
+
+    Parameters
+    ----------
+    burst : Burst
+        The frames.
+    settings : Settings
+        How.
+    device : torch.device
+        Where.
+    given : Bundle, optional
+        The bundle, where it is known.
+
+    Raises
+    ------
+    BurstError
+        There is a single frame, and no bundle.
+    """
+
+    def __init__(self, burst: Burst, settings: Settings, device: torch.device, given: Bundle | None) -> None:
+        if burst.shape[0] < 2 and given is None:
+            raise BurstError(
+                "one frame is a burst only where its bundle is known, because nothing in it tells bundle and object "
+                "apart; give a bundle (Bundle.from_image, or reconstruct(burst).bundle), or open at least 2 frames as "
+                "one (time, height, width) stack"
+            )
+        self._burst, self._settings, self._given = burst, settings, given
+        self._frames = torch.from_numpy(burst.frames).to(device)
+        self._grey = self._frames.mean(dim=3)
+
+    def align(self) -> Generator[Fitted | None, None, Fitted]:
+        """Calibrate and register; None until the bundle is known."""
+        bundle, notes = yield from self._calibrate()
+        samples = sample_cores(self._grey[..., None], bundle, self._burst)
+        fitted = Fitted(bundle=bundle, registration=unregistered(samples), canvas=self._frame_canvas(), notes=notes)
+        yield fitted
+        fitted = yield from self._register(fitted, samples)
+        return (yield from self._refine(fitted))
+
+    def solve(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
+        """Solve the scene for the bundle and motion as they are."""
+        samples = self._in_colour(fitted)
+        fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
+        grid = self._grid(1 / self._settings.upsample, fitted)
+        steps = solving(
+            samples,
+            fitted.registration,
+            grid,
+            smoothness=self._smoothness,
+            held_out=self._settings.held_out,
+            seed=self._settings.seed,
+        )
+        while True:
+            try:
+                fitted = self._with_scene(fitted, next(steps))
+                yield fitted
+            except StopIteration as end:
+                return self._with_scene(fitted, end.value)
+
+    def round_off(self, fitted: Fitted | None) -> Fitted:
+        """Make bundle, samples, motion and picture belong together, wherever the steps have ended."""
+        if fitted is None:
+            bundle = plain_frames(self._burst.shape[1:3], self._burst)
+            samples = sample_cores(self._grey[..., None], bundle, self._burst)
+            text = "the run ended before the bundle was calibrated"
+            fitted = Fitted(
+                bundle=bundle,
+                registration=unregistered(samples),
+                canvas=self._frame_canvas(),
+                notes=(_warned(text),),
+            )
+        elif fitted.registration.stage != "complete":
+            text = "the run ended before the frames were registered"
+            fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
+        return self._sketched(replace(fitted, samples=self._in_colour(fitted)))
+
+    def _calibrate(self) -> Generator[None, None, tuple[Bundle, tuple[str, ...]]]:
+        if self._given is None:
+            steps = calibrating(self._grey, self._burst)
+            while True:
+                try:
+                    next(steps)
+                    yield
+                except StopIteration as end:
+                    bundle: Bundle = end.value
+                    break
+        else:
+            placement = find_bundle(self._given.fitted_to(self._burst), self._grey, self._burst)
+            yield
+            bundle = placement.bundle
+            if placement.note:
+                return bundle, (_warned(placement.note),)
+        text = remark(bundle)
+        return bundle, (_warned(text),) if text else ()
+
+    def _register(self, fitted: Fitted, samples: Samples) -> Generator[Fitted, None, Fitted]:
+        """Find the motion by whole cores, with a picture on the way and at the end."""
+        steps = registering(
+            samples,
+            dof=self._settings.motion.dof,
+            rounds=self._rounds,
+            seed=self._settings.seed,
+        )
+        while True:
+            try:
+                registration = next(steps)
+            except StopIteration as end:
+                fitted = replace(fitted, registration=end.value)
+                break
+            is_rough = registration.stage == "fine" and fitted.registration.stage != "fine"
+            fitted = replace(fitted, registration=registration)
+            if is_rough:
+                fitted = self._sketched(fitted)
+            yield fitted
+        if fitted.registration.is_still and self._given is None:
+            fitted = self._with_equal_cores(fitted)
+        fitted = self._sketched(fitted)
+        yield fitted
+        return fitted
+
+    def _with_equal_cores(self, fitted: Fitted) -> Fitted:
+        """Take all cores as equal: without motion a core's gain cannot be told from what it sees."""
+        bundle = fitted.bundle
+        if bundle.is_resolved and not bundle.gains_known and fitted.registration.used.sum() > 1:
+            text = "the object moves too little to fill the gaps between cores; cores are taken as equally bright"
+            fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
+        return replace(fitted, bundle=with_even_gains(bundle))
+
+    def _refine(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
+        """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
+        registration = fitted.registration
+        bundle = fitted.bundle
+        if not registration.is_still and not bundle.gains_known:
+            used = np.flatnonzero(registration.used)
+            bundle = remeasure(
+                bundle,
+                self._grey[torch.from_numpy(registration.used)],
+                self._burst,
+                lambda number, pixels: registration.predicted(int(used[number]), pixels),
+            )
+        observe = sample_pixels if self._kind(bundle, registration) == "pixels" else sample_cores
+        sampled = observe(self._frames, bundle, self._burst)
+        samples = sampled.weighted(torch.from_numpy(registration.used))
+        fitted = replace(fitted, bundle=bundle, samples=samples)
+        if registration.is_still:
+            return fitted
+        steps = refining(
+            samples,
+            registration,
+            dof=self._settings.motion.dof,
+            rounds=self._rounds,
+            seed=self._settings.seed,
+        )
+        while True:
+            try:
+                fitted = replace(fitted, registration=next(steps))
+                yield fitted
+            except StopIteration as end:
+                found: Registration = end.value
+                break
+        gains = torch.from_numpy(found.gains).to(sampled.values)
+        weights = torch.from_numpy(found.frame_weights)
+        return replace(
+            fitted,
+            registration=found,
+            bundle=with_gains(bundle, gains),
+            samples=sampled.without_gains(gains).weighted(weights),
+        )
+
+    def _kind(self, bundle: Bundle, registration: Registration) -> str:
+        """Return whether cores or pixels are the samples: as asked for, or as the burst itself shows."""
+        if self._settings.observation != "auto":
+            return self._settings.observation
+        if not bundle.is_resolved:
+            return "pixels"
+        if registration.is_still:
+            return "cores"
+        cores = sample_cores(self._grey[..., None], bundle, self._burst).weighted(torch.from_numpy(registration.used))
+        return "pixels" if shows_detail(self._grey, bundle, self._burst, cores, registration.predicted) else "cores"
+
+    def _in_colour(self, fitted: Fitted) -> Samples:
+        """Return the final samples; before they are known, those of whole cores, with what is known of them."""
+        if fitted.samples is not None:
+            return fitted.samples
+        samples = sample_cores(self._frames, fitted.bundle, self._burst)
+        gains = torch.from_numpy(fitted.registration.gains).to(samples.values)
+        return samples.weighted(torch.from_numpy(fitted.registration.used)).without_gains(gains)
+
+    def _sketched(self, fitted: Fitted) -> Fitted:
+        """Solve a coarse picture of all that is known so far."""
+        samples = self._in_colour(fitted)
+        fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
+        spacing = max(_PREVIEW_SPACING / self._settings.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
+        scene = solve_quickly(samples, fitted.registration, self._grid(spacing, fitted), self._smoothness)
+        return self._with_scene(fitted, scene)
+
+    def _with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
+        """Return what is known with another scene, and the picture that it stands for."""
+        if fitted.scene is not None and scene.coefficients is fitted.scene.coefficients:
+            return replace(fitted, scene=scene)
+        image = SplineImage(
+            scene=scene.image,
+            grid=scene.grid,
+            known=scene.equations.density() > _LEAST_DENSITY,
+            reach=fitted.bundle.pitch,
+            fill=self._settings.fill,
+            homographies=fitted.registration.reference_from_frame,
+            black=self._black(fitted.bundle),
+        )
+        return replace(fitted, scene=scene, image=image)
+
+    def _black(self, bundle: Bundle) -> float:
+        levels = self._burst
+        return (bundle.black - levels.black_level) / (levels.white_level - levels.black_level)
+
+    @property
+    def _rounds(self) -> int | None:
+        """Rounds of registration at most: for a network, `iterations` counts its steps instead."""
+        return self._settings.iterations if isinstance(self._settings.encoding, Spline) else None
+
+    @property
+    def _smoothness(self) -> float | None:
+        encoding = self._settings.encoding
+        return encoding.smoothness if isinstance(encoding, Spline) else None
+
+    def _frame_canvas(self) -> Canvas:
+        return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]), self._settings.upsample)
+
+    def _canvas(self, registration: Registration, samples: Samples) -> Canvas:
+        """Lay the canvas over the reference frame, or over all that any frame saw."""
+        if self._settings.canvas == "frame":
+            return self._frame_canvas()
+        points = registration.points(samples.positions)[samples.weights > 0]
+        points = points[torch.isfinite(points).all(dim=1)]
+        low, high = points.amin(dim=0).floor().tolist(), points.amax(dim=0).ceil().tolist()
+        most = _MOST_FIELDS * max(self._burst.shape[1:3])
+        low, high = ([min(max(edge, -most), most) for edge in corner] for corner in (low, high))
+        return Canvas.over((low[0], low[1], high[0] + 1, high[1] + 1), self._settings.upsample)
+
+    def _grid(self, spacing: float, fitted: Fitted) -> Grid:
+        """Return a grid over the canvas and some more, its nodes on pixel centres where the spacing is a pixel's."""
+        canvas = fitted.canvas
+        first = canvas.frame0_from_image[:2, 2]
+        last = first + canvas.frame0_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
+        margin = spacing * np.ceil((fitted.bundle.pitch + fitted.bundle.radius) / spacing)
+        return Grid.over((*(first - margin).tolist(), *(last + margin).tolist()), spacing)
+
+
+def _warned(text: str) -> str:
+    logger.warning(text)
+    return text

@@ -1,0 +1,182 @@
+"""Step 4: solve the scene for samples whose places are known, at a smoothness that sets itself."""
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.scene.gains import GainChange, refine_gains
+from napari_fiberburst.scene.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
+from napari_fiberburst.scene.spline import NormalEquations, assemble
+from napari_fiberburst.steps import drain
+
+# Iterations of conjugate gradients for a scene on the way, from an even one.
+_DRAFT_ITERATIONS = 25
+PREVIEW_ITERATIONS = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """The scene as a linear spline, and what it was solved from.
+
+    Attributes
+    ----------
+    coefficients : Tensor
+        (C, H, W) at the nodes of the grid of `equations`, light above black, full scale 1.
+    smoothness : float
+        Weight of the prior.
+    equations : NormalEquations
+        That it solves.
+    samples : Samples
+        That it was solved from, their gains taken out.
+    gains : GainChange
+        That were taken out of the samples on the way.
+    is_draft : bool
+        Whether its smoothness is a usual one that has not been chosen yet.
+    resolution : float or None
+        Pixels, the finest period on which two halves of the burst agree; None where that is not known.
+    held_out_rmse : float or None
+        Root mean square error, full scale 1, of samples left out of the fit, before they were taken in.
+    """
+
+    coefficients: Tensor
+    smoothness: float
+    equations: NormalEquations
+    samples: Samples
+    gains: GainChange
+    is_draft: bool = True
+    resolution: float | None = None
+    held_out_rmse: float | None = None
+
+    @property
+    def grid(self) -> Grid:
+        """Where the nodes are."""
+        return self.equations.grid
+
+    @property
+    def filtered(self) -> Tensor:
+        """The scene as samples see it through their footprint, (C, H, W)."""
+        return self.equations.through(self.coefficients)
+
+    @property
+    def image(self) -> Tensor:
+        """The smooth image that the spline stands for, at the nodes, (C, H, W)."""
+        return self.equations.image(self.coefficients, self.smoothness)
+
+
+def solve(
+    samples: Samples,
+    registration: Registration,
+    grid: Grid,
+    *,
+    smoothness: float | None = None,
+    held_out: float = 0.05,
+    seed: int = 0,
+) -> Scene:
+    """Solve the scene for motion and gains as they are.
+
+    Parameters
+    ----------
+    samples : Samples
+        In all channels, gains taken out.
+    registration : Registration
+        Where they lie.
+    grid : Grid
+        Nodes of the scene, in pixels of the reference frame.
+    smoothness : float, optional
+        Weight of the prior; more is smoother. By default it is chosen by what one part of the samples tells of another.
+    held_out : float
+        Part of the samples that is left out at first and tells how well the scene predicts, 0 to 0.5.
+    seed : int
+        Draws which samples those are.
+
+    Returns
+    -------
+    Scene
+        Solved from all samples.
+    """
+    return drain(solving(samples, registration, grid, smoothness=smoothness, held_out=held_out, seed=seed))
+
+
+def solve_quickly(samples: Samples, registration: Registration, grid: Grid, smoothness: float | None) -> Scene:
+    """Return a first scene, for a preview."""
+    return _draft(samples, registration.points(samples.positions), grid, smoothness, PREVIEW_ITERATIONS)
+
+
+def solving(
+    samples: Samples,
+    registration: Registration,
+    grid: Grid,
+    *,
+    smoothness: float | None,
+    held_out: float,
+    seed: int,
+) -> Generator[Scene, None, Scene]:
+    """Solve as `solve` does; yields a draft, twice, and the scene before held-out samples are taken in."""
+    points = registration.points(samples.positions)
+    scene = _draft(samples, points, grid, smoothness, _DRAFT_ITERATIONS)
+    if not registration.is_still:
+        samples, gains = refine_gains(samples, points, grid, scene.filtered)
+        scene = replace(scene, samples=samples, gains=gains)
+    yield scene
+    chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
+    scene = replace(scene, resolution=chosen.resolution)
+    yield scene
+    left_out = _left_out(samples, held_out, seed)
+    equations = assemble(grid, samples, points, (~left_out).to(points))
+    coefficients = equations.solve(chosen.weight, scene.coefficients)
+    rmse = _missed(samples, points, grid, equations.through(coefficients), left_out)
+    scene = replace(
+        scene,
+        coefficients=coefficients,
+        smoothness=chosen.weight,
+        equations=equations,
+        is_draft=False,
+        held_out_rmse=rmse,
+    )
+    yield scene
+    if not left_out.any():
+        return scene
+    equations = equations + assemble(grid, samples, points, left_out.to(points))
+    return replace(scene, coefficients=equations.solve(chosen.weight, coefficients), equations=equations)
+
+
+def _draft(samples: Samples, points: Tensor, grid: Grid, smoothness: float | None, iterations: int) -> Scene:
+    equations = assemble(grid, samples, points)
+    weight = UNTOLD if smoothness is None else smoothness
+    coefficients = equations.solve(weight, equations.mean(), iterations)
+    return Scene(coefficients=coefficients, smoothness=weight, equations=equations, samples=samples, gains=GainChange())
+
+
+def _choose(scene: Scene, points: Tensor, registration: Registration) -> Smoothness:
+    samples = scene.samples
+    if registration.is_still and samples.radius is None:
+        return Smoothness(UNTOLD, None)
+    choose = choose_among_neighbours if registration.is_still else choose_smoothness
+    return choose(samples, points, np.flatnonzero(registration.used), scene.grid, scene.coefficients.mean(dim=0))
+
+
+def _left_out(samples: Samples, part: float, seed: int) -> Tensor:
+    """Return which samples (T, N) are left out to tell the error."""
+    generator = torch.Generator().manual_seed(seed)
+    chance = torch.rand(samples.weights.shape, generator=generator).to(samples.weights.device)
+    return (chance < part) & (samples.weights > 0)
+
+
+def _missed(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor, left_out: Tensor) -> float | None:
+    """Return the root mean square by which the scene misses the samples that were left out."""
+    total = mass = 0.0
+    for number, chosen in enumerate(left_out):
+        if not bool(chosen.any()):
+            continue
+        at = grid.at(points[number, chosen])
+        weights = samples.weights[number, chosen] * at.inside
+        for channel, light in zip(samples.values[number, chosen].T, filtered, strict=True):
+            total += float((weights * (channel - at.read(light)) ** 2).sum())
+            mass += float(weights.sum())
+    return (total / mass) ** 0.5 if mass > 0 else None
