@@ -71,3 +71,32 @@ def test_torch_and_qt_stay_where_they_belong():
         outside = {name.split(".")[0] for name in imported(path)}
         assert part in TORCH or "torch" not in outside, f"{path} imports torch"
         assert part == "plugin" or not outside & QT, f"{path} imports {outside & QT}"
+
+
+def assigns_to_another(path: Path) -> set[str]:
+    """Return the attributes that a file assigns to of anything but `self` or `cls`."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        for target in [part for whole in targets for part in (whole.elts if isinstance(whole, ast.Tuple) else [whole])]:
+            owner = target
+            while isinstance(owner, ast.Subscript | ast.Attribute):
+                owner, is_attribute = owner.value, isinstance(owner, ast.Attribute)
+                if is_attribute and isinstance(owner, ast.Name) and owner.id not in {"self", "cls"}:
+                    found.add(ast.unparse(target))
+    return found
+
+
+def test_nothing_outside_pipeline_and_plugin_reassigns_another_objects_attribute():
+    """The steps exchange frozen values: whoever holds one can rely on it. The command line sets tqdm's totals."""
+    for part, path in files():
+        if part not in {"pipeline", "plugin", "cli"}:
+            assert not assigns_to_another(path), f"{path} assigns to {assigns_to_another(path)}"
+
+
+def test_a_reassigned_attribute_is_noticed(tmp_path):
+    for line in ("other.x = 1", "other.x += 1", "self.held, other.x.y = 1, 2", "other.x[3] = 1"):
+        (tmp_path / "part.py").write_text(f"def change(self, other):\n    {line}\n", encoding="utf-8")
+        assert len(assigns_to_another(tmp_path / "part.py")) == 1
+    (tmp_path / "part.py").write_text("def change(self, array):\n    self.x = array[3] = 1\n", encoding="utf-8")
+    assert not assigns_to_another(tmp_path / "part.py")

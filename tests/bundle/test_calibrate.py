@@ -12,7 +12,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrate
 from napari_fiberburst.bundle.pitch import find_pitch
 from napari_fiberburst.bundle.samples import sample
-from napari_fiberburst.operators.grid import blur
+from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.simulation import Camera, simulate
 from napari_fiberburst.simulation.bundle import Bundle as SimulatedBundle
 

@@ -16,9 +16,7 @@ SHAPES = ((31, 37), (31, 97), (101, 33))
 
 def by_registration(shape, steps):
     """Return where registration takes frames for steps (T, k) along the generators, (T, 3, 3) in pixels."""
-    motion = FrameMotion(len(steps), shape)
-    motion.move(steps)
-    return motion.scene_from_frame.numpy()
+    return FrameMotion.still(len(steps), shape).moved(steps).scene_from_frame.numpy()
 
 
 def by_network(shape, steps):
@@ -61,11 +59,27 @@ def test_both_ways_take_the_same_steps(model, shape):
 def test_the_tangent_is_how_points_move(model):
     points = torch.rand(30, 2) * torch.tensor([37.0, 31.0])
     for generator in range(model.dof):
-        motion = FrameMotion(1, (31, 37))
+        motion = FrameMotion.still(1, (31, 37))
         step = torch.zeros(1, model.dof)
         step[0, generator] = 1e-3
         along_x, along_y = motion.tangent(points, model.dof)
-        motion.move(step)
-        moved = (motion.apply(points)[0] - points) / 1e-3
+        moved = (motion.moved(step).apply(points)[0] - points) / 1e-3
         expected = torch.stack([along_x[:, generator], along_y[:, generator]], dim=1)
         torch.testing.assert_close(moved, expected, rtol=0.02, atol=0.05)
+
+
+def test_travel_is_how_far_the_middle_of_a_frame_goes():
+    steps = torch.tensor([[0.01, 0.0, 0.3, 0.0], [0.03, -0.04, 0.0, 0.02]], dtype=torch.float64)
+    motion = FrameMotion.still(2, (31, 37))
+    middle = torch.tensor([[18.0, 15.0]], dtype=torch.float64)
+    gone = (motion.moved(steps).apply(middle) - middle).norm(dim=-1).max()
+    assert motion.travel(steps) == pytest.approx(float(gone), rel=0.03)
+
+
+def test_frames_that_run_away_are_told():
+    shifts = np.array([[0.0, 0], [5, 0], [40, 0], [0, 0], [0, 0]])
+    matrices = FrameMotion.of_shifts(shifts, (31, 37)).scene_from_frame.clone()
+    matrices[3, :2, :2] *= 2
+    matrices[4, 0, 0] = torch.nan
+    left = FrameMotion(matrices, (31, 37)).has_left(np.zeros((5, 2)), most=3.0)
+    np.testing.assert_array_equal(left, [False, False, True, True, True])

@@ -22,7 +22,7 @@ from napari_fiberburst.bundle.pitch import find_pitch
 from napari_fiberburst.bundle.samples import SATURATED, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
-from napari_fiberburst.operators.grid import blur, local_mean
+from napari_fiberburst.operators.filters import blur, local_mean
 from napari_fiberburst.steps import drain
 
 # In pitches: over this much the mean frame is blurred to tell bundle from object. One pitch takes gain for object: it

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
-from napari_fiberburst.operators.grid import blur, local_mean
+from napari_fiberburst.operators.filters import blur, local_mean
 
 # In pitches: how far from all cores a place is a gap in the lattice.
 _GAP = 0.85

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.operators.grid import local_mean
+from napari_fiberburst.operators.filters import local_mean
 
 # Pitches looked for, pixels. Below, cores and pixels beat; above, a frame holds too few cores to tell.
 LEAST_PITCH, MOST_PITCH = 2.3, 24.0

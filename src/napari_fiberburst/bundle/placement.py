@@ -21,7 +21,7 @@ from napari_fiberburst.bundle.cores import find_cores
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import BundleError
-from napari_fiberburst.operators.grid import local_mean
+from napari_fiberburst.operators.filters import local_mean
 
 # How far a bundle may have moved.
 MOST_SHIFT, MOST_ROTATION = 5.0, 2.0

@@ -15,7 +15,8 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from napari_fiberburst.motion.models import FrameMotion
-from napari_fiberburst.operators.grid import Grid, blur
+from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.operators.grid import Grid
 
 # Pictures for the coarse search have at most this many pixels a side.
 _MOST_SIDE = 128
@@ -85,16 +86,16 @@ def confidence(
     grid = Grid.around(points, 0.7 * pitch, 2 * pitch)
     at = [grid.at(frame) for frame in points]
     totals = torch.stack(
-        [torch.stack([a.write(v * w), a.write(w)]) for a, v, w in zip(at, values, weights, strict=True)]
+        [torch.stack([a.adjoint(v * w), a.adjoint(w)]) for a, v, w in zip(at, values, weights, strict=True)]
     )
     totals = blur(totals, 0.8)
     others = totals.sum(dim=0) - totals
     found = []
     for a, own, (light, mass), (own_light, own_mass) in zip(at, weights, others, totals, strict=True):
-        enough = a.read(mass) > 0.5 * own.mean()
+        enough = a(mass) > 0.5 * own.mean()
         weight = own * enough * a.inside
-        here = a.read(own_light) / a.read(own_mass).clamp_min(1e-9)
-        there = a.read(light) / a.read(mass).clamp_min(1e-9)
+        here = a(own_light) / a(own_mass).clamp_min(1e-9)
+        there = a(light) / a(mass).clamp_min(1e-9)
         found.append(_correlation(here, there, weight))
     return np.array(found)
 
@@ -115,8 +116,8 @@ def _pictures(
     """Return the frames as small pictures (T, h, w), and where there is something to see, (T, h, w)."""
     height, width = shape
     at = Grid.over((0, 0, width - 1, height - 1), spacing).at(positions)
-    light = blur(torch.stack([at.write(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
-    mass = blur(torch.stack([at.write(w) for w in weights]), sigma)
+    light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
+    mass = blur(torch.stack([at.adjoint(w) for w in weights]), sigma)
     mask = mass > 0.2 * mass.mean()
     return torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask
 

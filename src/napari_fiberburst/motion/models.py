@@ -1,5 +1,7 @@
 """The motion of frames: one plane projective transform each, moved along the generators of a chosen model."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,7 +14,7 @@ _GENERATORS = torch.tensor(
     [
         [[0, 0, 1], [0, 0, 0], [0, 0, 0]],  # shift along x
         [[0, 0, 0], [0, 0, 1], [0, 0, 0]],  # shift along y
-        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],  # turn
+        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],  # rotation
         [[1 / 3, 0, 0], [0, 1 / 3, 0], [0, 0, -2 / 3]],  # scale
         [[1, 0, 0], [0, -1, 0], [0, 0, 0]],  # stretch along x against y
         [[0, 1, 0], [1, 0, 0], [0, 0, 0]],  # stretch along the diagonals
@@ -28,34 +30,39 @@ def generators(dof: int) -> Tensor:
     return _GENERATORS[:dof].clone()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameMotion:
     """One transform per frame, on the manifold of its model (compositional, as in Lucas-Kanade 20 years on, 2004).
 
     Transforms are kept in float64 on the host, whatever the device; the points move on theirs.
 
-    Parameters
-    ----------
-    count : int
-        T.
-    shape : (int, int)
-        Height and width of a frame.
-
     Attributes
     ----------
     scene_from_frame : Tensor
         (T, 3, 3) float64 in pixels.
+    shape : (int, int)
+        Height and width of a frame.
     """
 
-    def __init__(self, count: int, shape: tuple[int, int]) -> None:
-        height, width = shape
-        self.half = max(height, width) / 2
-        self.centre = torch.tensor([(width - 1) / 2, (height - 1) / 2])
-        self.scene_from_frame = torch.eye(3, dtype=torch.float64).repeat(count, 1, 1)
-        self._unit = torch.from_numpy(half_frame_from_pixel(shape))
+    scene_from_frame: Tensor
+    shape: tuple[int, int]
 
-    def shift(self, translations: NDArray[np.float64]) -> None:
-        """Set pure translations (T, 2), pixels."""
-        self.scene_from_frame[:, :2, 2] = torch.from_numpy(translations)
+    @classmethod
+    def still(cls, count: int, shape: tuple[int, int]) -> "FrameMotion":
+        """Return the motion of so many frames that all lie on the scene as they are."""
+        return cls(torch.eye(3, dtype=torch.float64).repeat(count, 1, 1), shape)
+
+    @classmethod
+    def of_shifts(cls, shifts: NDArray[np.float64], shape: tuple[int, int]) -> "FrameMotion":
+        """Return pure translations (T, 2), pixels."""
+        matrices = torch.eye(3, dtype=torch.float64).repeat(len(shifts), 1, 1)
+        matrices[:, :2, 2] = torch.from_numpy(shifts)
+        return cls(matrices, shape)
+
+    @property
+    def _half(self) -> float:
+        """Half of the longer side, pixels: the unit of the generators."""
+        return max(self.shape) / 2
 
     def apply(self, points: Tensor) -> Tensor:
         """Map frame points (N, 2) into the scene, by every frame: (T, N, 2)."""
@@ -63,20 +70,30 @@ class FrameMotion:
 
     def tangent(self, points: Tensor, dof: int) -> tuple[Tensor, Tensor]:
         """Return how scene points (..., 2) move, in pixels along x and y, per unit of each generator: (..., k)."""
-        x, y = ((points - self.centre.to(points)) / self.half).unbind(dim=-1)
+        height, width = self.shape
+        centre = torch.tensor([(width - 1) / 2, (height - 1) / 2])
+        x, y = ((points - centre.to(points)) / self._half).unbind(dim=-1)
         one, zero = torch.ones_like(x), torch.zeros_like(x)
         along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:dof], dim=-1)
         along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:dof], dim=-1)
-        return along_x * self.half, along_y * self.half
+        return along_x * self._half, along_y * self._half
 
-    def move(self, steps: Tensor) -> Tensor:
-        """Move each frame by its step (T, k) along the generators; return how far its centre goes, pixels (T,)."""
+    def moved(self, steps: Tensor) -> "FrameMotion":
+        """Return the motion with each frame moved by its step (T, k) along the generators."""
         steps = steps.detach().cpu().double()
         change = torch.linalg.matrix_exp(torch.einsum("tk,kij->tij", steps, _GENERATORS[: steps.shape[1]]))
-        moved = torch.linalg.inv(self._unit) @ change @ self._unit @ self.scene_from_frame
-        self.scene_from_frame = moved / moved[:, 2:, 2:]
-        moved_by: Tensor = steps[:, :2].norm(dim=1) * self.half
-        return moved_by
+        half_from_pixel = torch.from_numpy(half_frame_from_pixel(self.shape))
+        matrices = torch.linalg.inv(half_from_pixel) @ change @ half_from_pixel @ self.scene_from_frame
+        return FrameMotion(matrices / matrices[:, 2:, 2:], self.shape)
+
+    def travel(self, steps: Tensor) -> float:
+        """Return the longest way that a frame's centre goes by its step (T, k), pixels."""
+        return float(steps[:, :2].detach().cpu().double().norm(dim=1).max()) * self._half
+
+    def where(self, chosen: NDArray[np.bool_], other: "FrameMotion") -> "FrameMotion":
+        """Return this motion for the frames that are chosen (T,), and the other one for the rest."""
+        mask = torch.from_numpy(chosen)[:, None, None]
+        return FrameMotion(torch.where(mask, self.scene_from_frame, other.scene_from_frame), self.shape)
 
     def has_left(self, shifts: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
         """Return which frames' transforms have run away, (T,).
@@ -88,11 +105,11 @@ class FrameMotion:
         most : float
             So has one whose area has grown or shrunk by more than this factor.
         """
-        width, height = (2 * self.centre + 1).tolist()
+        height, width = self.shape
         corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64)
         places = transform_points(self.scene_from_frame, corners).numpy()
         x, y = places[..., 0], places[..., 1]
         area = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1) / 2 / (height * width)
-        way = np.abs(places.mean(axis=1) - [width / 2, height / 2] - shifts).max(axis=1)
-        left: NDArray[np.bool_] = ~((area > 1 / most) & (area < most) & (way < max(width, height)))  # NaN has left
+        distance = np.abs(places.mean(axis=1) - [width / 2, height / 2] - shifts).max(axis=1)
+        left: NDArray[np.bool_] = ~((area > 1 / most) & (area < most) & (distance < max(width, height)))  # NaN has left
         return left

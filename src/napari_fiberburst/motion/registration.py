@@ -13,7 +13,20 @@ from torch import Tensor
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import LEAST_CONFIDENCE, confidence, find_shifts
-from napari_fiberburst.motion.joint import COARSE, ENOUGH, FINE_CORES, FINE_PIXELS, FINER, Groupwise, Level
+from napari_fiberburst.motion.joint import (
+    COARSE,
+    FINE_CORES,
+    FINE_PIXELS,
+    FINER,
+    JointProblem,
+    JointState,
+    Level,
+    enter,
+    iterate,
+    normalise,
+    predict,
+    start,
+)
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.steps import drain
@@ -23,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 # The motion has a handful of unknowns a frame, so this many samples of it are plenty,
 _MOST_SAMPLES = 500_000
-# and the first rounds, which only bring rotation and perspective into reach, need fewer.
+# and the first iterations, which only bring rotation and perspective into reach, need fewer.
 _COARSE_SAMPLES = 60_000
 # Root mean square over the corners, in pitches: frames that move less do not fill the gaps between cores.
 _LEAST_MOTION = 0.25
@@ -31,6 +44,8 @@ _LEAST_MOTION = 0.25
 _LEAST_OF_USUAL = 0.6
 # A frame whose area grows or shrinks by more than this factor, or that leaves by more than its own size, is lost.
 _MOST_SWELLING = 3.0
+# Pixels: iterations at a level end where no frame's centre moves farther than this.
+_ENOUGH = 0.015
 # Of full scale: the mean light that values are divided by, at least.
 _LEAST_LIGHT = 1e-4
 
@@ -74,13 +89,13 @@ class Registration(Stored):
         (G,) float32, gain of each core relative to what the samples assume; 1 where none was looked for.
     residual : float
         Root of the weighted mean square of what the model leaves of the samples, full scale 1; NaN before the first
-        round.
+        iteration.
     is_still : bool
         Whether the object moves too little to fill the gaps between cores.
     stage : str
         How far it has come: "none", "shifts", "coarse", "fine" (shear and perspective too), or "complete".
-    rounds : int
-        Gauss-Newton rounds done.
+    iterations : int
+        Gauss-Newton iterations done.
     notes : tuple of str
         What a user should know.
     scene : GreyScene or None
@@ -97,7 +112,7 @@ class Registration(Stored):
     residual: float = float("nan")
     is_still: bool = False
     stage: Stage = "none"
-    rounds: int = 0
+    iterations: int = 0
     notes: tuple[str, ...] = ()
     scene: GreyScene | None = field(default=None, repr=False)
 
@@ -136,11 +151,11 @@ class Registration(Stored):
         if self.scene is None or not self.used[number]:
             return torch.zeros(len(pixels)).to(pixels)
         matrix = torch.from_numpy(self.scene_from_frame[number]).to(pixels)
-        at = self.scene.grid.at(transform_points(matrix, pixels))
-        return at.read(self.scene.nodes) * self.scene.light
+        sampling = self.scene.grid.at(transform_points(matrix, pixels))
+        return sampling(self.scene.nodes) * self.scene.light
 
 
-def register(samples: Samples, *, dof: int = 8, rounds: int | None = None, seed: int = 0) -> Registration:
+def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, seed: int = 0) -> Registration:
     """Find how every frame lies on the scene.
 
     Parameters
@@ -150,17 +165,17 @@ def register(samples: Samples, *, dof: int = 8, rounds: int | None = None, seed:
     dof : int
         Degrees of freedom of each frame's motion: 2 for a translation, 4 for a similarity, 6 for an affine transform, 8
         for a homography; 0 where the frames are known not to move.
-    rounds : int, optional
-        Gauss-Newton rounds at most.
+    iterations : int, optional
+        Gauss-Newton iterations at most.
     seed : int
-        The first rounds use some of the samples, drawn by this seed.
+        The first iterations use some of the samples, drawn by this seed.
 
     Returns
     -------
     Registration
         Frames that do not belong are marked in `used`, and named in `notes`.
     """
-    return drain(registering(samples, dof=dof, rounds=rounds, seed=seed))
+    return drain(registering(samples, dof=dof, iterations=iterations, seed=seed))
 
 
 def unregistered(samples: Samples) -> Registration:
@@ -176,9 +191,9 @@ def unregistered(samples: Samples) -> Registration:
 
 
 def registering(
-    samples: Samples, *, dof: int, rounds: int | None, seed: int
+    samples: Samples, *, dof: int, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
-    """Register as `register` does; yields what is known after each round."""
+    """Register as `register` does; yields what is known after each iteration."""
     start = unregistered(samples)
     if len(samples.values) < 2:
         return _alone(start, samples)
@@ -195,11 +210,11 @@ def registering(
     )
     moved = shifts.shifts - shifts.shifts[found.reference]
     moved[~found.used] = 0
-    found.scene_from_frame[:, :2, 2] = moved
+    found = replace(found, scene_from_frame=FrameMotion.of_shifts(moved, samples.shape).scene_from_frame.numpy())
     yield found
     if found.used.sum() < 2:
         return _alone(found, samples)
-    search = _Search(samples, dof, moved, np.inf if rounds is None else rounds, seed)
+    search = _Search(samples=samples, dof=dof, shifts=moved, iterations=iterations, seed=seed)
     found = yield from search.refine(replace(found, stage="coarse"), (COARSE,), None, _COARSE_SAMPLES)
     found = replace(found, stage="fine")
     yield found
@@ -211,9 +226,9 @@ def registering(
 
 
 def refining(
-    samples: Samples, found: Registration, *, dof: int, rounds: int | None, seed: int
+    samples: Samples, found: Registration, *, dof: int, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
-    """Refine a registration, and find the gains, by the final samples of the bundle; yields after each round.
+    """Refine a registration, and find the gains, by the final samples of the bundle; yields after each iteration.
 
     Parameters
     ----------
@@ -223,112 +238,110 @@ def refining(
         By `register`; its frames lie on the same scene.
     dof, seed
         As for `register`.
-    rounds : int, optional
-        Gauss-Newton rounds at most, those that `found` has had included.
+    iterations : int, optional
+        Gauss-Newton iterations at most, those that `found` has had included.
     """
     if found.scene is None or found.is_still:
         return found
-    left = np.inf if rounds is None else rounds - found.rounds
-    search = _Search(samples, dof, found.scene_from_frame[:, :2, 2].copy(), left, seed)
+    shifts = found.scene_from_frame[:, :2, 2].copy()
+    search = _Search(samples=samples, dof=dof, shifts=shifts, iterations=iterations, seed=seed)
     levels, most = (FINE_PIXELS, _MOST_SAMPLES) if samples.kind == "pixels" else (FINE_CORES, None)
     return (yield from search.refine(found, levels, samples.radius, most))
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Search:
-    """Gauss-Newton rounds from where the frames lie."""
+    """Gauss-Newton iterations from where the frames lie."""
 
-    def __init__(self, samples: Samples, dof: int, shifts: NDArray[np.float64], rounds: float, seed: int) -> None:
-        self._samples, self._dof, self._shifts = samples, dof, shifts
-        self._left, self._seed = rounds, seed
+    samples: Samples
+    dof: int
+    shifts: NDArray[np.float64]
+    iterations: int | None
+    seed: int
 
     def refine(
         self, found: Registration, levels: tuple[Level, ...], radius: float | None, most: int | None
     ) -> Generator[Registration, None, Registration]:
-        """Refine by at most so many samples, seen through a footprint of this radius; yields after each round."""
-        samples = self._samples.weighted(torch.from_numpy(found.used))
-        light = _light(samples) if found.scene is None else found.scene.light
-        group = self._group(samples, found, light, most)
+        """Refine by at most so many samples, seen through a footprint of this radius; yields after each iteration."""
+        light = _light(self.samples, found) if found.scene is None else found.scene.light
+        problem = self._problem(found, light, most)
+        motion = FrameMotion(torch.from_numpy(found.scene_from_frame), self.samples.shape)
+        state = start(problem, motion, None if found.scene is None else (found.scene.grid, found.scene.nodes))
         for level in levels:
-            if self._left <= 0:
+            if self._is_spent(found):
                 break
-            group.enter(level, radius)
-            for number in range(level.rounds):
-                before = group.motion.scene_from_frame.clone()
-                longest = group.round(level, number)
-                lost = group.motion.has_left(self._shifts, _MOST_SWELLING)
+            state = enter(problem, state, level, radius)
+            for number in range(level.iterations):
+                before = state.motion
+                state, farthest = iterate(problem, state, level, number)
+                lost = state.motion.has_left(self.shifts, _MOST_SWELLING)
                 if lost.any():
-                    group.motion.scene_from_frame[torch.from_numpy(lost)] = before[torch.from_numpy(lost)]
+                    state = replace(state, motion=state.motion.where(~lost, before))
                     if (found.used & ~lost).any():
                         found = replace(found, used=found.used & ~lost)
-                        group.weights = group.weights * torch.from_numpy(~lost).to(group.weights)[:, None]
-                self._left -= 1
-                found = self._state(found, group, light)
+                        problem = problem.without(torch.from_numpy(lost))
+                found = self._registered(replace(found, iterations=found.iterations + 1), problem, state, light)
                 yield found
-                if self._left <= 0 or (longest < ENOUGH and number > 0):
+                if self._is_spent(found) or (farthest < _ENOUGH and number > 0):
                     break
-            group.settle()
-        return replace(
-            self._state(found, group, light), rounds=found.rounds, frame_weights=_fit_weights(group, found.used)
-        )
+            state = normalise(problem, state)
+        weights = _frame_weights(problem, state, found.used)
+        return replace(self._registered(found, problem, state, light), frame_weights=weights)
 
-    def _group(self, samples: Samples, found: Registration, light: float, most: int | None) -> Groupwise:
-        """Return a joint registration of the samples, or of so many of them, from where the frames and scene are."""
-        device = samples.positions.device
+    def _is_spent(self, found: Registration) -> bool:
+        return self.iterations is not None and found.iterations >= self.iterations
+
+    def _problem(self, found: Registration, light: float, most: int | None) -> JointProblem:
+        """Return the problem of the samples, or of so many of them that are drawn from all."""
+        samples, device = self.samples.weighted(torch.from_numpy(found.used)), self.samples.positions.device
         chosen = torch.arange(len(samples.positions), device=device)
         if most is not None:
             wanted = max(1, most // int(found.used.sum()))
-            generator = torch.Generator().manual_seed(self._seed)
+            generator = torch.Generator().manual_seed(self.seed)
             chosen = torch.randperm(len(samples.positions), generator=generator)[:wanted].sort().values.to(device)
-        motion = FrameMotion(len(found.used), samples.shape)
-        motion.scene_from_frame = torch.from_numpy(found.scene_from_frame.copy())
-        group = Groupwise(
-            samples.positions[chosen],
-            samples.values[:, chosen].mean(dim=2) / light,
-            samples.weights[:, chosen],
-            motion,
-            samples.pitch,
-            self._dof,
-            sources=samples.core_index[chosen] if samples.kind == "pixels" else None,
+        return JointProblem(
+            positions=samples.positions[chosen],
+            values=samples.values[:, chosen].mean(dim=2) / light,
+            weights=samples.weights[:, chosen],
+            core_index=samples.core_index[chosen],
+            cores=samples.cores,
+            pitch=samples.pitch,
+            dof=self.dof,
             gains_fixed=samples.gains_known,
         )
-        if found.scene is not None:
-            group.grid, group.scene = found.scene.grid, found.scene.nodes
-        return group
 
-    def _state(self, found: Registration, group: Groupwise, light: float) -> Registration:
+    def _registered(self, found: Registration, problem: JointProblem, state: JointState, light: float) -> Registration:
         """Return what is known now."""
-        gains = np.ones(self._samples.cores, np.float32)
-        gains[: len(group.gains)] = group.gains.cpu().numpy()
+        is_every_core_asked = self.samples.kind == "pixels" or len(problem.positions) == len(self.samples.positions)
         return replace(
             found,
-            scene_from_frame=group.motion.scene_from_frame.numpy().copy(),
-            gains=gains if self._samples.kind == "pixels" or len(group.gains) == len(gains) else found.gains,
-            residual=group.residual * light,
-            rounds=found.rounds + 1,
-            scene=GreyScene(grid=group.grid, nodes=group.scene, light=light),
+            scene_from_frame=state.motion.scene_from_frame.numpy().copy(),
+            gains=state.gains.cpu().numpy() if is_every_core_asked else found.gains,
+            residual=state.residual * light,
+            scene=GreyScene(grid=state.grid, nodes=state.scene, light=light),
         )
 
 
-def _light(samples: Samples) -> float:
-    """Return the mean light of the samples, full scale 1."""
+def _light(samples: Samples, found: Registration) -> float:
+    """Return the mean light of the samples of frames that take part, full scale 1."""
+    samples = samples.weighted(torch.from_numpy(found.used))
     mass = samples.weights.sum().clamp_min(1e-9)
     return max(float((samples.grey * samples.weights).sum() / mass), _LEAST_LIGHT)
 
 
-def _fit_weights(group: Groupwise, used: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _frame_weights(problem: JointProblem, state: JointState, used: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return how much each frame should count, (T,), by how well it fits the scene: a blurred one fits worse."""
-    left = (group.values - group.predicted()).square() * group.weights
-    error = (left.sum(dim=1) / group.weights.sum(dim=1).clamp_min(1e-9)).cpu().numpy()
+    left = (problem.values - predict(problem, state)).square() * problem.weights
+    error = (left.sum(dim=1) / problem.weights.sum(dim=1).clamp_min(1e-9)).cpu().numpy()
     usual = np.median(error[used])
-    fit: NDArray[np.float32] = (used * np.clip(usual / np.maximum(error, 1e-12), 0, 1)).astype(np.float32)
-    return fit
+    weights: NDArray[np.float32] = (used * np.clip(usual / np.maximum(error, 1e-12), 0, 1)).astype(np.float32)
+    return weights
 
 
 def _judged(found: Registration, samples: Samples) -> Registration:
     """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
     samples = samples.weighted(torch.from_numpy(found.used))
-    motion = FrameMotion(len(found.used), samples.shape)
-    motion.scene_from_frame = torch.from_numpy(found.scene_from_frame)
+    motion = FrameMotion(torch.from_numpy(found.scene_from_frame), samples.shape)
     values = samples.grey / torch.from_numpy(found.gains).to(samples.values)[samples.core_index]
     agreement = confidence(samples.positions, values, samples.weights, motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)

@@ -54,6 +54,10 @@ class Footprint:
         filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
         return filtered
 
+    def adjoint(self, pictures: Tensor) -> Tensor:
+        """Return the filtered pictures."""
+        return self(pictures)
+
     def transfer(self, along_y: Tensor, along_x: Tensor) -> Tensor:
         """Return the filter's response at frequencies (Fy,) by (Fx,), cycles per node: (Fy, Fx)."""
         reach = self._kernel.shape[0] // 2

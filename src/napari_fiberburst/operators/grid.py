@@ -4,10 +4,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor
 
 from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.operators.stencil import Stencil
 
 # Grids beyond this are a sign of a motion gone wrong, not of a picture.
 _MOST_NODES = 2**27
@@ -58,20 +58,20 @@ class Grid:
         y, x = torch.meshgrid(rows + self.y0, columns + self.x0, indexing="ij")
         return torch.stack([x, y], dim=-1)
 
-    def at(self, points: Tensor) -> "Interpolation":
-        """Prepare to read and write at points (..., 2)."""
-        return Interpolation(self, points)
+    def at(self, points: Tensor) -> "Sampling":
+        """Return the operator that samples pictures at points (..., 2)."""
+        return Sampling(self, points)
 
 
-class Interpolation:
-    """Bilinear interpolation at fixed points, its gradient and its adjoint.
+class Sampling:
+    """Bilinear interpolation at fixed points: calling it samples a picture, its adjoint splats values onto the nodes.
 
     Parameters
     ----------
     grid : Grid
         The nodes.
     points : Tensor
-        (..., 2) as (x, y). What lies outside the nodes reads as 0 and writes nothing.
+        (..., 2) as (x, y). What lies outside the nodes is sampled as 0 and splats nothing.
 
     Attributes
     ----------
@@ -95,10 +95,18 @@ class Interpolation:
         corners = torch.stack([left * above, self._x * above, left * self._y, self._x * self._y], dim=-1)
         self._weight = corners * self.inside.unsqueeze(-1)
 
-    def read(self, picture: Tensor) -> Tensor:
-        """Return the picture (H, W) at the points, (...)."""
+    def __call__(self, picture: Tensor) -> Tensor:
+        """Return a picture (H, W) at the points, (...)."""
         values: Tensor = (picture.reshape(-1)[self._index] * self._weight).sum(dim=-1)
         return values
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return what values (...) at the points add to the nodes, (H, W)."""
+        return self._add(values.unsqueeze(-1) * self._weight, self._index)
+
+    def of_channels(self, pictures: Tensor) -> Tensor:
+        """Return pictures (C, H, W) at the points, (..., C)."""
+        return torch.stack([self(picture) for picture in pictures], dim=-1)
 
     def gradient(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         """Return the picture's slope per pixel along x and along y at the points; 0 outside."""
@@ -108,16 +116,12 @@ class Interpolation:
         along_y = ((1 - self._x) * (c - a) + self._x * (d - b)) * scale
         return along_x, along_y
 
-    def write(self, values: Tensor) -> Tensor:
-        """Return the adjoint of `read`: what values (...) at the points add to the nodes, (H, W)."""
-        return self._add(values.unsqueeze(-1) * self._weight, self._index)
+    def normal_diagonal(self, weights: Tensor) -> Tensor:
+        """Return the diagonal of S' W S, (H, W), S being this operator and W weights (...)."""
+        return self._add(weights.unsqueeze(-1) * self._weight.square(), self._index)
 
-    def write_squares(self, values: Tensor) -> Tensor:
-        """Return the diagonal of read^T diag(values) read, (H, W)."""
-        return self._add(values.unsqueeze(-1) * self._weight.square(), self._index)
-
-    def normal(self, weights: Tensor) -> "Stencil":
-        """Return read^T diag(weights) read as a stencil: each node is tied to its eight neighbours alone."""
+    def normal(self, weights: Tensor) -> Stencil:
+        """Return S' W S: each node is coupled to its eight neighbours alone."""
         a, b, c, d = self._weight.unbind(dim=-1)
         ia, ib, ic, _ = self._index.unbind(dim=-1)
         first, weight = torch.stack([ia, ic], dim=-1), weights.unsqueeze(-1)
@@ -125,82 +129,10 @@ class Interpolation:
         below = self._add(weight * torch.stack([a * c, b * d], dim=-1), torch.stack([ia, ib], dim=-1))
         below_right = self._add(weights * a * d, ia)
         below_left = self._add(weights * b * c, ib)
-        return Stencil(torch.stack([self.write_squares(weights), right, below, below_right, below_left]))
+        return Stencil(torch.stack([self.normal_diagonal(weights), right, below, below_right, below_left]))
 
     def _add(self, values: Tensor, index: Tensor) -> Tensor:
         rows, columns = self.grid.shape
         total = torch.zeros(rows * columns, dtype=values.dtype, device=values.device)
         total.scatter_add_(0, index.reshape(-1), values.reshape(-1))
         return total.reshape(rows, columns)
-
-
-class Stencil:
-    """A symmetric matrix over nodes that ties each to its eight neighbours.
-
-    Parameters
-    ----------
-    bands : Tensor
-        (5, H, W): the diagonal, and the ties to the right, below, below right and below left.
-    """
-
-    def __init__(self, bands: Tensor) -> None:
-        self.bands = bands
-
-    def __add__(self, other: "Stencil") -> "Stencil":
-        return Stencil(self.bands + other.bands)
-
-    @property
-    def diagonal(self) -> Tensor:
-        """The diagonal, (H, W)."""
-        return self.bands[0]
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Return the product with pictures (..., H, W)."""
-        diagonal, right, below, below_right, below_left = self.bands
-        y: Tensor = diagonal * x
-        tie = right[:, :-1]
-        y[..., :, :-1] += tie * x[..., :, 1:]
-        y[..., :, 1:] += tie * x[..., :, :-1]
-        tie = below[:-1]
-        y[..., :-1, :] += tie * x[..., 1:, :]
-        y[..., 1:, :] += tie * x[..., :-1, :]
-        tie = below_right[:-1, :-1]
-        y[..., :-1, :-1] += tie * x[..., 1:, 1:]
-        y[..., 1:, 1:] += tie * x[..., :-1, :-1]
-        tie = below_left[:-1, 1:]
-        y[..., :-1, 1:] += tie * x[..., 1:, :-1]
-        y[..., 1:, :-1] += tie * x[..., :-1, 1:]
-        return y
-
-
-def roughness(x: Tensor) -> Tensor:
-    """Return D^T D x for pictures (..., H, W), D the differences between neighbours: the membrane's energy gradient."""
-    y = torch.zeros_like(x)
-    step = x[..., :, 1:] - x[..., :, :-1]
-    y[..., :, 1:] += step
-    y[..., :, :-1] -= step
-    step = x[..., 1:, :] - x[..., :-1, :]
-    y[..., 1:, :] += step
-    y[..., :-1, :] -= step
-    return y
-
-
-def blur(pictures: Tensor, sigma: float) -> Tensor:
-    """Filter pictures (..., H, W) by a Gaussian of `sigma` nodes; outside is 0."""
-    reach = math.ceil(4 * sigma)
-    shape = [int(next_fast_len(side + reach, real=True)) for side in pictures.shape[-2:]]
-    along_y, along_x = (
-        torch.exp(-2 * (math.pi * sigma * frequencies(side, device=pictures.device)) ** 2)
-        for side, frequencies in zip(shape, (torch.fft.fftfreq, torch.fft.rfftfreq), strict=True)
-    )
-    spectrum = torch.fft.rfft2(pictures, s=shape) * (along_y[:, None] * along_x)
-    filtered: Tensor = torch.fft.irfft2(spectrum, s=shape)[..., : pictures.shape[-2], : pictures.shape[-1]]
-    return filtered
-
-
-def local_mean(picture: Tensor, sigma: float, weight: Tensor | None = None) -> Tensor:
-    """Return the Gaussian-weighted mean about each node of (H, W); 0 where nothing has weight."""
-    weight = torch.ones_like(picture) if weight is None else weight
-    total, mass = blur(torch.stack([picture * weight, weight]), sigma)
-    mean: Tensor = total / mass.clamp_min(1e-4)
-    return mean

@@ -17,6 +17,7 @@ from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
+from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import Scene
 
 # Less than this part of a sample is the rim of one.
@@ -71,10 +72,10 @@ def diagnose(
     )
     if not is_scene_shown:
         return found
-    residuals, variance = _residuals(samples, points, registration, scene)
+    residuals, variance = _residuals(samples, points, scene)
     most = max(float(scene.coefficients.std()), 1e-6)
     deviation = scene.equations.deviation(scene.smoothness, variance, most, max(1.0, bundle.radius))
-    expected = scene.grid.at(_places(canvas, deviation)).read(deviation)
+    expected = scene.grid.at(_places(canvas, deviation))(deviation)
     return replace(
         found,
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
@@ -88,16 +89,13 @@ def _places(canvas: Canvas, like: Tensor) -> Tensor:
     return torch.from_numpy(canvas.points().astype(np.float32)).to(like.device)
 
 
-def _residuals(samples: Samples, points: Tensor, registration: Registration, scene: Scene) -> tuple[Tensor, float]:
+def _residuals(samples: Samples, points: Tensor, scene: Scene) -> tuple[Tensor, float]:
     """Return the root mean square residual per frame and core, (T, N), and the variance of samples of weight 1."""
     filtered = scene.filtered
     found = torch.full((len(samples.weights), samples.cores), torch.nan).to(filtered)
     total = mass = 0.0
-    for number in np.flatnonzero(registration.used):
-        at = scene.grid.at(points[number])
-        light = torch.stack([at.read(channel) for channel in filtered], dim=1)
-        weight = samples.weights[number] * at.inside
-        square = ((samples.values[number] - light) ** 2).mean(dim=1) * weight
+    for number, values, light, weight in predict(samples, points, scene.grid, filtered):
+        square = ((values - light) ** 2).mean(dim=1) * weight
         sums, weights = (
             torch.zeros(samples.cores).to(filtered).index_add_(0, samples.core_index, part) for part in (square, weight)
         )
@@ -115,12 +113,12 @@ def _coverage(
     count = torch.zeros(grid.shape).to(places)
     for number in np.flatnonzero(registration.used):
         seen = samples.weights[number] > 0
-        count += grid.at(points[number, seen]).write(torch.ones(int(seen.sum())).to(places))
+        count += grid.at(points[number, seen]).adjoint(torch.ones(int(seen.sum())).to(places))
     if samples.radius is None:
-        coverage = grid.at(places).read(count) / grid.spacing**2
+        coverage = grid.at(places)(count) / grid.spacing**2
     else:
         area = math.pi * (samples.radius / grid.spacing) ** 2
-        coverage = grid.at(places).read(Footprint(grid, samples.radius, count.device)(count)) * area
+        coverage = grid.at(places)(Footprint(grid, samples.radius, count.device)(count)) * area
     coverage[coverage < _LEAST_COVERAGE] = 0
     array: NDArray[np.float32] = coverage.cpu().numpy().astype(np.float32)
     return array

@@ -172,7 +172,7 @@ class Stages:
         steps = registering(
             samples,
             dof=self._settings.motion.dof,
-            rounds=self._rounds,
+            iterations=self._iterations,
             seed=self._settings.seed,
         )
         while True:
@@ -222,7 +222,7 @@ class Stages:
             samples,
             registration,
             dof=self._settings.motion.dof,
-            rounds=self._rounds,
+            iterations=self._iterations,
             seed=self._settings.seed,
         )
         while True:
@@ -288,8 +288,8 @@ class Stages:
         return (bundle.black - levels.black_level) / (levels.white_level - levels.black_level)
 
     @property
-    def _rounds(self) -> int | None:
-        """Rounds of registration at most: for a network, `iterations` counts its steps instead."""
+    def _iterations(self) -> int | None:
+        """Iterations of registration at most: for a network, `iterations` counts its steps instead."""
         return self._settings.iterations if isinstance(self._settings.encoding, Spline) else None
 
     @property

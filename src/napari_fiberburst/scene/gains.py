@@ -7,6 +7,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.scene.prediction import predict
 
 # A core's gain in a channel is asked for where it has seen at least this part of the light that the median core has.
 _LEAST_LIGHT_OF_USUAL = 0.05
@@ -101,15 +102,11 @@ def _compare(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> 
     agreement = torch.zeros_like(samples.values[0])
     power = torch.zeros_like(agreement)
     left = mass = torch.zeros(()).to(agreement)
-    for number, weights in enumerate(samples.weights):
-        if not bool((weights > 0).any()):
-            continue
-        at = grid.at(points[number])
-        light = torch.stack([at.read(channel) for channel in filtered], dim=1)
-        weight = (weights * at.inside)[:, None]
-        agreement += weight * samples.values[number] * light
+    for _, values, light, weights in predict(samples, points, grid, filtered):
+        weight = weights[:, None]
+        agreement += weight * values * light
         power += weight * light**2
-        left = left + (weight * (samples.values[number] - light) ** 2).sum()
+        left = left + (weight * (values - light) ** 2).sum()
         mass = mass + weight.sum() * light.shape[1]
     return agreement, power, left / mass.clamp_min(1e-9)
 

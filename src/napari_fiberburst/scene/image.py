@@ -70,10 +70,10 @@ class SplineImage:
     def masked(self, picture: NDArray[np.float32], points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
         """Return a picture (H, W, C) drawn at a frame's pixels, NaN off the scene, and where no core looked near."""
         places = torch.from_numpy(self._mapped(points, frame).astype(np.float32)).to(self.scene.device)
-        at = self.grid.at(places)
-        far = ~at.inside
+        sampling = self.grid.at(places)
+        far = ~sampling.inside
         if not self._fill:
-            far |= at.read(self._distance()) > self._reach
+            far |= sampling(self._distance()) > self._reach
         return np.where(far.cpu().numpy()[..., None], np.float32(np.nan), picture)
 
     @cached_property

@@ -1,7 +1,7 @@
 """How smooth the scene should be, chosen by what one part of the burst tells of another."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
-from napari_fiberburst.operators.grid import Grid, blur
+from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import ring_correlation
+from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.spline import NormalEquations
 
 # Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
@@ -104,19 +106,18 @@ def choose_among_neighbours(
     """
     window = _window(grid, scene)
     grey = samples.values.mean(dim=2, keepdim=True)
+    in_grey = replace(samples, values=grey)
+    taking_part = torch.zeros(len(grey), dtype=torch.bool)
+    taking_part[torch.from_numpy(frames)] = True
     fold = torch.randperm(grey.shape[1], generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
     risks = np.zeros(len(_STILL_CANDIDATES))
     for left in range(_FOLDS):
         normal = NormalEquations.empty(window, samples.radius, 1, points.device)
         for number in frames:
             normal = normal.with_samples(points[number], grey[number], samples.weights[number] * (fold != left))
+        asked = taking_part.to(fold.device)[:, None] & (fold == left)
         for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
-            shown = normal.through(guess)[0]
-            for number in frames:
-                asked = (fold == left) & (samples.weights[number] > 0)
-                at = window.at(points[number, asked])
-                weights = samples.weights[number, asked] * at.inside
-                risks[index] += float((weights * (grey[number, asked, 0] - at.read(shown)) ** 2).sum())
+            risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]
     return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
 
 

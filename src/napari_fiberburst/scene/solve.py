@@ -11,6 +11,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.gains import GainChange, refine_gains
+from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
 from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.steps import drain
@@ -130,14 +131,14 @@ def solving(
     left_out = _left_out(samples, held_out, seed)
     equations = assemble(grid, samples, points, (~left_out).to(points))
     coefficients = equations.solve(chosen.weight, scene.coefficients)
-    rmse = _missed(samples, points, grid, equations.through(coefficients), left_out)
+    missed, mass = misfit(samples, points, grid, equations.through(coefficients), left_out)
     scene = replace(
         scene,
         coefficients=coefficients,
         smoothness=chosen.weight,
         equations=equations,
         is_draft=False,
-        held_out_rmse=rmse,
+        held_out_rmse=(missed / mass) ** 0.5 if mass > 0 else None,
     )
     yield scene
     if not left_out.any():
@@ -166,17 +167,3 @@ def _left_out(samples: Samples, part: float, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     chance = torch.rand(samples.weights.shape, generator=generator).to(samples.weights.device)
     return (chance < part) & (samples.weights > 0)
-
-
-def _missed(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor, left_out: Tensor) -> float | None:
-    """Return the root mean square by which the scene misses the samples that were left out."""
-    total = mass = 0.0
-    for number, chosen in enumerate(left_out):
-        if not bool(chosen.any()):
-            continue
-        at = grid.at(points[number, chosen])
-        weights = samples.weights[number, chosen] * at.inside
-        for channel, light in zip(samples.values[number, chosen].T, filtered, strict=True):
-            total += float((weights * (channel - at.read(light)) ** 2).sum())
-            mass += float(weights.sum())
-    return (total / mass) ** 0.5 if mass > 0 else None

@@ -23,9 +23,14 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_pictures
+from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.footprint import Footprint
-from napari_fiberburst.operators.grid import Grid, Stencil, blur, roughness
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
+from napari_fiberburst.operators.stencil import Stencil
 
+# Relative error at which conjugate gradients end: far below the noise of any sample.
 _TOLERANCE = 1e-3
 _FREQUENCIES = 33
 # Nodes with less than this part of the densest sampling are beyond what was seen.
@@ -65,11 +70,11 @@ class NormalEquations:
     def with_samples(self, points: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
         """Return the equations with samples at points (N, 2) of values (N, C) and weights (N,)."""
         used = weights > 0
-        at, values, weights = self.grid.at(points[used]), values[used], weights[used]
+        sampling, values, weights = self.grid.at(points[used]), values[used], weights[used]
         rhs = torch.stack(
-            [light + at.write(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
+            [light + sampling.adjoint(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
         )
-        return replace(self, bands=self.bands + at.normal(weights).bands, rhs=rhs)
+        return replace(self, bands=self.bands + sampling.normal(weights).bands, rhs=rhs)
 
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
         return replace(self, bands=self.bands + other.bands, rhs=self.rhs + other.rhs)
@@ -85,12 +90,12 @@ class NormalEquations:
         return None if self.radius is None else Footprint.cached(self.grid, self.radius, self.rhs.device)
 
     @property
-    def _order(self) -> int:
-        """Of the derivatives that the prior holds down."""
-        return 1 if self.radius is None else 2
+    def prior(self) -> SmoothnessPrior:
+        """P: of slopes for points, of curvature for footprints."""
+        return MEMBRANE if self.radius is None else THIN_PLATE
 
     def through(self, scene: Tensor) -> Tensor:
-        """Return the scene (..., H, W) as sensors see it, by their footprint."""
+        """Return the scene (..., H, W) as samples see it through their footprint."""
         return scene if self.footprint is None else self.footprint(scene)
 
     def solve(self, smoothness: float, start: Tensor, iterations: int = 60) -> Tensor:
@@ -109,23 +114,21 @@ class NormalEquations:
         diagonal = self.stencil.diagonal * (1.0 if self.footprint is None else self.footprint.power)
         if self.footprint is not None:
             diagonal = blur(diagonal, 1.0).clamp_min(0)
-        inverse = 1 / (diagonal + weight * (4 if self._order == 1 else 20) + 1e-9)
-        right = self.through(self.rhs)
-        scene = start
-        residual = right - self._multiply(scene, weight)
-        search = inverse * residual
-        power = (residual * search).sum(dim=(-1, -2), keepdim=True)
-        enough = _TOLERANCE**2 * (right.square() * inverse).sum(dim=(-1, -2), keepdim=True)
-        for number in range(iterations):
-            product = self._multiply(search, weight)
-            step = power / (search * product).sum(dim=(-1, -2), keepdim=True).clamp_min(1e-30)
-            scene = scene + step * search
-            residual = residual - step * product
-            before, ready = power, inverse * residual
-            power = (residual * ready).sum(dim=(-1, -2), keepdim=True)
-            if number % 4 == 3 and bool((power <= enough).all()):  # looking makes the host wait for the device
-                break
-            search = ready + power / before.clamp_min(1e-30) * search
+        inverse = 1 / (diagonal + weight * self.prior.diagonal + 1e-9)
+
+        def multiply(blocks: Blocks) -> Blocks:
+            (scene,) = blocks
+            return (self.through(self.stencil(self.through(scene))) + weight * self.prior(scene),)
+
+        (scene,) = conjugate_gradients(
+            multiply,
+            (self.through(self.rhs),),
+            lambda blocks: (inverse * blocks[0],),
+            start=(start,),
+            iterations=iterations,
+            tolerance=_TOLERANCE,
+            inner=inner_of_pictures,
+        )
         return scene
 
     def image(self, scene: Tensor, smoothness: float) -> Tensor:
@@ -155,7 +158,7 @@ class NormalEquations:
         (square_y, gain_y), (square_x, gain_x) = _read_gain(along_y, below + ties), _read_gain(along_x, right + ties)
         square, gain = square_y[:, None] * square_x, gain_y[:, None] * gain_x
         passed = mean * self._transfer(along_y, along_x) ** 2
-        prior = self._weight(smoothness) * self._prior(along_y, along_x)
+        prior = self._weight(smoothness) * self.prior.response(along_y, along_x)
         ideal = (passed * square + prior) / (gain * (passed + prior)).clamp_min(1e-12)
         shown: Tensor = torch.fft.irfft2(torch.fft.rfft2(padded) * ideal, s=(height, width))
         return shown[..., _RIM:-_RIM, _RIM:-_RIM]
@@ -168,7 +171,7 @@ class NormalEquations:
 
     def density(self) -> Tensor:
         """Return the weight of samples per node, (H, W): what the stencil does to an even scene."""
-        return self.stencil(torch.ones_like(self.stencil.diagonal))
+        return self.stencil.row_sums
 
     def deviation(self, smoothness: float, variance: float, most: float, reach: float) -> Tensor:
         """Return the posterior's standard deviation of the scene, (H, W), were sampling everywhere as it is nearby.
@@ -178,7 +181,7 @@ class NormalEquations:
         known of the scene without samples; `reach`, in pixels, is over what distance sampling is averaged.
         """
         frequency = (torch.arange(_FREQUENCIES) + 0.5) / (2 * _FREQUENCIES)
-        prior = self._weight(smoothness) * self._prior(frequency, frequency)
+        prior = self._weight(smoothness) * self.prior.response(frequency, frequency)
         transfer = self._transfer(frequency, frequency) ** 2
         densities = torch.logspace(-4, 3, 57)
         table = (variance / (densities[:, None, None] * transfer + prior)).mean(dim=(1, 2))
@@ -188,22 +191,13 @@ class NormalEquations:
 
     def _weight(self, smoothness: float) -> float:
         """Return the prior's weight for nodes that are not a pixel apart."""
-        return smoothness / self.grid.spacing ** (2 * self._order - 2)
-
-    def _prior(self, along_y: Tensor, along_x: Tensor) -> Tensor:
-        """Return the prior's energy at frequencies (Fy,) by (Fx,), cycles per node."""
-        slope_y, slope_x = (4 * torch.sin(math.pi * along) ** 2 for along in (along_y, along_x))
-        return (slope_y[:, None] + slope_x) ** self._order
+        return smoothness / self.grid.spacing ** (2 * self.prior.order - 2)
 
     def _transfer(self, along_y: Tensor, along_x: Tensor) -> Tensor:
         """Return the footprint's response at frequencies (Fy,) by (Fx,), cycles per node."""
         if self.footprint is None:
             return torch.ones(len(along_y), len(along_x)).to(along_y)
         return self.footprint.transfer(along_y, along_x)
-
-    def _multiply(self, scene: Tensor, weight: float) -> Tensor:
-        prior = roughness(scene) if self._order == 1 else roughness(roughness(scene))
-        return self.through(self.stencil(self.through(scene))) + weight * prior
 
 
 def _read_gain(frequency: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
