@@ -20,7 +20,7 @@ from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.reconstruct import iterate
 from napari_fiberburst.pipeline.stages import Stages
-from napari_fiberburst.settings import choose
+from napari_fiberburst.settings import SplineMethod, choose
 from napari_fiberburst.simulation import simulate
 
 # Frames, side, channels: one of them grows while the others stay.
@@ -125,7 +125,7 @@ def _stages(side: int, device: str) -> Row:
         spent[name] = spent.get(name, 0.0) + now - last
         last = now
 
-    stages = Stages(burst, choose(device=device), find_device(device), None)
+    stages = Stages(burst, SplineMethod(), find_device(device))
     fitted, is_registered = None, False
     steps = stages.align()
     while True:

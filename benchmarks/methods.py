@@ -25,7 +25,7 @@ from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.pipeline.stages import Fitted, Stages
 from napari_fiberburst.quality import psnr
 from napari_fiberburst.results.reconstruction import draw
-from napari_fiberburst.settings import choose
+from napari_fiberburst.settings import SplineMethod
 from napari_fiberburst.simulation import SimulatedBurst
 from napari_fiberburst.steps import drain
 
@@ -134,7 +134,7 @@ def gaussian_fixed(case: Case, simulated: SimulatedBurst, effort: Effort) -> Out
 def registered_mean(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return the mean of the frames, each moved onto frame 0 by our registration; no bundle model beyond that."""
     start = time.perf_counter()
-    fitted = drain(Stages(simulated.burst, choose(), find_device(effort.device), None).align())
+    fitted = drain(Stages(simulated.burst, SplineMethod(), find_device(effort.device)).align())
     homographies = fitted.registration.reference_from_frame
     picture = mean_over(simulated.burst.frames, homographies)
     return Outcome(picture=picture, seconds=time.perf_counter() - start, homographies=homographies)
@@ -180,13 +180,12 @@ def default(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
 def oracle(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return what our solver makes of the burst when it is told the true motion and transmission."""
     start = time.perf_counter()
-    settings = choose(fill=True, device=effort.device)
     burst, bundle = simulated.burst, Bundle.from_image(simulated.transmission)
     samples = sample(burst, bundle, "pixels" if case.physics == "mask" else "cores", device=effort.device)
     known = Registration.known(simulated.homographies, samples.cores)
     canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]))
     told = Fitted(bundle=bundle, registration=known, canvas=canvas, samples=samples)
-    found = drain(Stages(burst, settings, find_device(effort.device), bundle).solve(told))
+    found = drain(Stages(burst, SplineMethod(fill=True), find_device(effort.device), given=bundle).solve(told))
     assert found.image is not None
     return Outcome(
         picture=_in_full_scale(simulated, draw(found.image, canvas, 0, burst)),

@@ -28,7 +28,7 @@ def main() -> None:
         shown.append(np.rint(np.clip(level, 0, 1) * 255).astype(np.uint8))
     gap = np.full((shown[0].shape[0], 12, *shown[0].shape[2:]), 255, np.uint8)
     Image.fromarray(np.concatenate([shown[0], gap, shown[1]], axis=1)).save(options.output)
-    print(f"{result.seconds:.1f} s, {result.settings.encoding}; wrote {options.output}")
+    print(f"{result.seconds:.1f} s, {result.settings.method}; wrote {options.output}")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import torch
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.networks.training import BETAS, Problem
 from napari_fiberburst.pipeline.reconstruct import iterate
-from napari_fiberburst.settings import choose
+from napari_fiberburst.settings import PublishedMethod, Settings
 from napari_fiberburst.simulation import simulate
 
 SHAPE = (256, 256)
@@ -45,12 +45,12 @@ def seconds(function: Callable[[], object]) -> float:
 
 def main() -> None:
     """Measure and print."""
-    settings = choose("paper", device="cpu", iterations=(PAIRS + 1) * STEPS)
+    method = PublishedMethod(iterations=(PAIRS + 1) * STEPS)
     burst = simulate("histology", shape=SHAPE, seed=0).burst
-    problem = Problem(burst, settings, torch.device("cpu"))
-    step = bare(JointField(settings, burst.shape), problem)
+    problem = Problem(burst, method, torch.device("cpu"))
+    step = bare(JointField(method, burst.shape), problem)
     # Every step reports here, which is more often than a run would.
-    run = iterate(burst, settings)
+    run = iterate(burst, Settings(method=method, device="cpu"))
     ratios, times = [], []
     for _ in range(PAIRS + 1):
         before = seconds(step)

@@ -31,7 +31,7 @@ first = reconstruct(
     on_progress=watch,
     control=control,
 )
-print(f"{first.ending} after {len(first.losses)} steps; sigma is {first.settings.encoding}")
+print(f"{first.ending} after {len(first.losses)} steps; sigma is {first.settings.value_of('sigma'):g}")
 
 # The networks stand for the burst: saved, loaded, drawn at another size, continued.
 first.save("tissue.npz")

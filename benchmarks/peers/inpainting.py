@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from napari_fiberburst.networks.scene import make_scene
-from napari_fiberburst.settings import choose
+from napari_fiberburst.settings import Fourier, PublishedMethod
 from napari_fiberburst.simulation import Bundle
 
 # Cycles per pitch: finer features than the cores can tell draw noise between them.
@@ -32,7 +32,7 @@ def inpaint(frame: NDArray[np.float32], bundle: Bundle, *, steps: int = STEPS, s
     height, width, channels = frame.shape
     generator = torch.Generator().manual_seed(seed)
     sigma = PERIODS_PER_PITCH * max(height, width) / 2 / bundle.pitch
-    chosen = choose("paper", encoding="fourier", sigma=sigma)
+    chosen = PublishedMethod(encoding=Fourier(sigma=sigma))
     network = make_scene(chosen, 2, channels, generator)
     centres, seen = core_intensities(frame, bundle)
     size = np.array([width, height])

@@ -3,11 +3,10 @@
 import threading
 from collections.abc import Callable
 
-from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.settings import Fourier, Settings
+from napari_fiberburst.settings import Fourier, NetworkMethod
 from napari_fiberburst.settings.parameter import knobs_of
 
-_KNOBS = {"sigma": knobs_of(Fourier)["sigma"], "learning_rate": knobs_of(Settings)["learning_rate"]}
+_KNOBS = {"sigma": knobs_of(Fourier)["sigma"], "learning_rate": knobs_of(NetworkMethod)["learning_rate"]}
 # How often a paused run asks whether it should end.
 _SECONDS_BETWEEN_LOOKS = 0.1
 
@@ -87,7 +86,6 @@ class Control:
 
 def _checked(name: str, value: float | None) -> float | None:
     """Return a live value by the rule that its setting has."""
-    knob = _KNOBS[name]
-    if value is not None and not knob.allows(value):
-        raise SettingsError(f"{name} must be {knob.expected}; got {value!r}")
+    if value is not None:
+        _KNOBS[name].check(value)
     return value

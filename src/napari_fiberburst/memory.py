@@ -1,6 +1,6 @@
 """How much memory a run will take, told before it starts."""
 
-from napari_fiberburst.settings import Settings, Spline
+from napari_fiberburst.settings import NetworkMethod, PublishedMethod, Settings, SplineMethod
 
 # Fitted to what `benchmarks/memory.py` measures, from above.
 _FIXED = 200 * 2**20
@@ -26,10 +26,13 @@ def estimate_memory(shape: tuple[int, int, int, int], settings: Settings) -> int
     618
     """
     frames, height, width, channels = shape
-    nodes = height * width * settings.upsample**2 * (_UNION if settings.canvas == "union" else 1)
     samples = frames * height * width * channels
-    units = 0
-    if not isinstance(settings.encoding, Spline):
-        batch = settings.batch or height * width // _PUBLISHED_BATCHES
-        units = batch * settings.scene_layers * settings.scene_width
+    method = settings.method
+    is_union, units = False, 0
+    if isinstance(method, SplineMethod | NetworkMethod):
+        is_union = method.canvas == "union"
+    if isinstance(method, NetworkMethod | PublishedMethod):
+        batch = method.batch or height * width // _PUBLISHED_BATCHES
+        units = batch * method.scene_layers * method.scene_width
+    nodes = height * width * method.upsample**2 * (_UNION if is_union else 1)
     return int(_FIXED + _BYTES_PER_SAMPLE * samples + _BYTES_PER_NODE * nodes + _BYTES_PER_UNIT * units)

@@ -51,7 +51,7 @@ def test_reconstruct_takes_a_crop_and_settings_by_name(burst_file, tmp_path):
     told = json.loads((tmp_path / "picture.json").read_text())
     assert tifffile.imread(out).shape == (3, 20, 30)
     assert told["burst"]["origin"] == [5, 10]
-    assert told["settings"]["encoding"] == {"name": "nerf", "highest_octave": 3}
+    assert told["settings"]["method"]["encoding"] == {"name": "nerf", "highest_octave": 3}
     assert told["seed"] == 7
 
 

@@ -24,7 +24,7 @@ def test_a_run_returns_what_it_promises(fit, tiny_burst):
     assert result.ending == "finished"
     assert result.device == "cpu"
     assert result.seconds > 0
-    assert result.settings.iterations == 10
+    assert result.settings.method.iterations == 10
 
 
 @pytest.mark.parametrize("motion", ["none", "homography", "flow", "flow_tv"])
@@ -120,7 +120,7 @@ def test_no_previews_are_drawn_unless_asked_for(fit, tiny_burst):
 
 def test_the_loss_is_the_mean_squared_error_of_its_samples(tiny_burst):
     settings = choose("paper", iterations=1, scene_width=8, motion_width=8, batch=100, device="cpu")
-    problem = Problem(tiny_burst, settings, torch.device("cpu"))
+    problem = Problem(tiny_burst, settings.method, torch.device("cpu"))
     batch = PixelStream(tiny_burst, torch.device("cpu"), seed=0).draw(100)
     with torch.no_grad():
         expected = (problem.field(batch.points, batch.frames) - batch.intensities).square().mean()
@@ -128,9 +128,9 @@ def test_the_loss_is_the_mean_squared_error_of_its_samples(tiny_burst):
 
 
 def test_a_step_takes_an_eighth_of_a_frame_unless_told(tiny_burst):
-    published = Problem(tiny_burst, choose("paper"), torch.device("cpu"))
+    published = Problem(tiny_burst, choose("paper").method, torch.device("cpu"))
     assert published.batch == -(-31 * 37 // 8)
-    assert Problem(tiny_burst, choose("paper", batch=7), torch.device("cpu")).batch == 7
+    assert Problem(tiny_burst, choose("paper", batch=7).method, torch.device("cpu")).batch == 7
 
 
 def test_the_burst_is_left_as_it_was(fit, rng):

@@ -132,7 +132,7 @@ def test_the_union_shows_what_other_frames_saw(cores):
 
 def test_smoothness_can_be_fixed(cores):
     rough, smooth = (reconstruct(cores.burst, smoothness=value, fill=True) for value in (1e-3, 10.0))
-    assert rough.settings.encoding.smoothness == 1e-3
+    assert rough.settings.method.smoothness == 1e-3
     assert np.abs(np.diff(rough.image, axis=0)).mean() > 1.5 * np.abs(np.diff(smooth.image, axis=0)).mean()
 
 
@@ -148,7 +148,7 @@ def test_networks_run_on_the_same_samples(encoding):
     # The registration it starts from is kept, or bettered.
     assert motion_error(result.homographies, simulated.homographies, (67, 81)) < 0.6
     if encoding == "fourier":
-        assert result.settings.encoding.sigma == pytest.approx(0.3 * 81 / 2 / 5, rel=0.1)
+        assert result.settings.method.encoding.sigma == pytest.approx(0.3 * 81 / 2 / 5, rel=0.1)
 
 
 def test_a_network_ends_where_it_stops_meeting_unseen_samples_better(monkeypatch):
@@ -233,7 +233,7 @@ def test_progress_tells_what_was_chosen(tiny_burst):
     reports = []
     small = {"scene_width": 8, "scene_layers": 1, "features": 8, "iterations": 3}
     result = reconstruct(tiny_burst, encoding="fourier", **small, on_progress=reports.append)
-    assert reports[0].settings.encoding.sigma is None
+    assert reports[0].settings.method.encoding.sigma is None
     assert reports[-1].settings == result.settings
-    assert result.settings.encoding.sigma > 0
+    assert result.settings.method.encoding.sigma > 0
     assert reports[-1].canvas.shape == result.canvas.shape

@@ -30,7 +30,12 @@ def test_stopping_before_the_first_step_gives_the_start(fit, tiny_burst):
     assert len(result.losses) == 0
     assert np.isfinite(result.image).all()
     np.testing.assert_array_equal(result.homographies[0], np.eye(3))
-    start = JointField(result.settings, tiny_burst.shape).motion.scene_from_frame().detach().numpy()
+    start = (
+        JointField(result.settings.method, tiny_burst.shape, seed=result.settings.seed)
+        .motion.scene_from_frame()
+        .detach()
+        .numpy()
+    )
     expected = relative_to(in_pixels(start.astype(np.float64), (31, 37)), 0)
     np.testing.assert_allclose(result.homographies, expected, atol=1e-6)
 
@@ -94,8 +99,8 @@ def test_sigma_and_learning_rate_change_while_it_runs(fit, tiny_burst):
         control.sigma, control.learning_rate = 1.5, 1e-2
 
     result = fit(tiny_burst, control=control, on_progress=turn)
-    assert result.settings.encoding.sigma == 1.5
-    assert result.settings.learning_rate == 1e-2
+    assert result.settings.method.encoding.sigma == 1.5
+    assert result.settings.method.learning_rate == 1e-2
     assert result.renderer.field.scene.encoding.sigma.item() == 1.5
     assert not np.array_equal(result.image, fit(tiny_burst).image)
 
@@ -126,7 +131,7 @@ def test_what_broke_a_run_is_not_in_the_settings_it_goes_back_to(fit, tiny_burst
 
     result = fit(tiny_burst, iterations=2000, control=control, on_progress=turn)
     assert result.ending == "diverged"
-    assert result.settings.learning_rate == choose("paper").learning_rate
+    assert result.settings.method.learning_rate == choose("paper").method.learning_rate
     longer = fit(tiny_burst, initial=result, iterations=5)
     assert longer.ending == "finished"
 
@@ -175,7 +180,9 @@ def test_a_spent_budget_is_not_inherited(fit, tiny_burst):
 
 def test_a_run_continues_with_its_own_settings(tiny_burst):
     first = reconstruct(tiny_burst, preset="paper", encoding="siren", omega_0=7.0, iterations=2, batch=50, device="cpu")
-    assert reconstruct(tiny_burst, initial=first, iterations=1).settings.encoding == first.settings.encoding
+    assert (
+        reconstruct(tiny_burst, initial=first, iterations=1).settings.method.encoding == first.settings.method.encoding
+    )
 
 
 def test_continuing_another_fit_is_refused(fit, tiny_burst):

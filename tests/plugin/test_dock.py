@@ -113,7 +113,7 @@ def test_sigma_can_be_turned_while_running(open_dock, qtbot, burst_layer):
     rows["sigma"]._editor.setValue(3.5)
     with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
         pass
-    assert dock.runs.run.result.settings.encoding.sigma == 3.5
+    assert dock.runs.run.result.settings.method.encoding.sigma == 3.5
 
 
 def test_a_network_goes_on_for_more_steps(open_dock, qtbot, run_through, burst_layer):
@@ -136,7 +136,7 @@ def test_a_spline_has_nothing_to_go_on_for(open_dock, run_through, burst_layer):
 def test_open_settings_say_what_was_chosen(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
-    chosen = run.result.settings.encoding.smoothness
+    chosen = run.result.settings.method.smoothness
     assert dock.form._rows["smoothness"]._auto.text() == f"auto ({chosen:.3g})"
     assert "smoothness" not in dock.form.choices()
 

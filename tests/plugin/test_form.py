@@ -7,7 +7,7 @@ from qtpy.QtWidgets import QLabel, QVBoxLayout, QWidget
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.preferences import Preferences, remember, remembered
 from napari_fiberburst.plugin.sections import section
-from napari_fiberburst.settings import ENCODINGS, MOTIONS, choose
+from napari_fiberburst.settings import ENCODING_NAMES, MOTIONS, choice_docs, choose
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_only_what_applies_is_shown(form):
     assert "canvas" not in set(shown(form))
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", ENCODING_NAMES)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_every_choice_shows_every_knob_it_has(form, motion, encoding):
     form._motion.setCurrentText(motion)
@@ -86,7 +86,7 @@ def test_tooltips_are_the_settings_own_words(form):
     knob = choose().knobs["upsample"]
     assert knob.doc in form._rows["upsample"].toolTip()
     tips = [form._encoding.itemData(row, Qt.ItemDataRole.ToolTipRole) for row in range(form._encoding.count())]
-    assert tips == [choice.__doc__.splitlines()[0] for choice in ENCODINGS.values()]
+    assert tips == [text for part, _, text in choice_docs() if part == "encoding"]
 
 
 def test_an_open_knob_shows_what_was_chosen_and_stays_open(form):

@@ -145,7 +145,7 @@ def test_compression_counts_bytes_as_they_came(result):
 def test_provenance_is_json(result):
     told = json.loads(json.dumps(result.provenance()))
     assert told["seed"] == 0
-    assert told["settings"]["encoding"]["name"] == "fourier"
+    assert told["settings"]["method"]["encoding"]["name"] == "fourier"
     assert np.shape(told["homographies"]) == (5, 3, 3)
     assert len(told["losses"]) == 60
 

@@ -8,7 +8,9 @@ import pytest
 
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.settings import (
+    ENCODING_NAMES,
     ENCODINGS,
+    METHODS,
     MOTIONS,
     PUBLISHED_MOTIONS,
     FlowTV,
@@ -17,6 +19,8 @@ from napari_fiberburst.settings import (
     Homography,
     HomographyNetwork,
     NeRF,
+    NetworkMethod,
+    PublishedMethod,
     Settings,
     choose,
 )
@@ -24,7 +28,8 @@ from napari_fiberburst.settings.parameter import knobs_of
 
 
 def test_the_paper_preset_has_the_published_values():
-    settings = choose("paper")
+    settings = choose("paper").method
+    assert isinstance(settings, PublishedMethod)
     assert settings.motion == HomographyNetwork(motion_layers=3, motion_width=256)
     assert settings.encoding == Fourier(features=256, sigma=5.0)
     assert (settings.scene_layers, settings.scene_width) == (4, 256)
@@ -37,9 +42,9 @@ def test_the_paper_preset_has_the_published_values():
 
 def test_fields_reach_the_part_they_belong_to():
     settings = choose("paper", motion="flow_tv", tv_weight=0.5, features=8, iterations=7)
-    assert settings.motion == FlowTV(tv_weight=0.5)
-    assert settings.encoding == Fourier(features=8, sigma=5.0)
-    assert settings.iterations == 7
+    assert settings.method.motion == FlowTV(tv_weight=0.5)
+    assert settings.method.encoding == Fourier(features=8, sigma=5.0)
+    assert settings.method.iterations == 7
 
 
 def test_none_leaves_the_value_that_is_there():
@@ -93,17 +98,21 @@ def test_bad_choices_are_refused_with_what_is_known(choices, said):
 
 def test_numbers_of_other_kinds_become_pythons_own():
     settings = choose("paper", seed=np.int64(3), sigma=Fraction(3, 2), iterations=np.uint8(4))
-    assert [type(settings.seed), type(settings.encoding.sigma), type(settings.iterations)] == [int, float, int]
+    assert [type(value) for value in (settings.seed, settings.method.encoding.sigma, settings.method.iterations)] == [
+        int,
+        float,
+        int,
+    ]
     assert settings == choose("paper", seed=3, sigma=1.5, iterations=4)
 
 
 def test_a_settings_object_refuses_a_part_that_is_none():
     with pytest.raises(SettingsError, match="one of NoMotion, Translation"):
-        Settings(motion="homography")
+        NetworkMethod(motion="homography")
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", ENCODING_NAMES)
 def test_settings_survive_json(motion, encoding):
     if encoding == "spline" and motion.startswith("flow"):
         encoding = "fourier"
@@ -118,14 +127,14 @@ def test_published_settings_survive_json(motion):
 
 
 def test_the_observation_decides_what_a_homography_is():
-    assert choose(motion="homography").motion == Homography()
-    assert choose("paper", motion="homography").motion == HomographyNetwork()
-    assert choose(observation="frames").motion == HomographyNetwork()
-    assert choose("paper", observation="auto").motion == Homography()
-    assert choose("paper", observation="cores").encoding == Fourier(sigma=5.0)
+    assert choose(motion="homography").method.motion == Homography()
+    assert choose("paper", motion="homography").method.motion == HomographyNetwork()
+    assert choose(observation="frames").method.motion == HomographyNetwork()
+    assert choose("paper", observation="auto").method.motion == Homography()
+    assert choose("paper", observation="cores").method.encoding == Fourier(sigma=5.0)
 
 
-@pytest.mark.parametrize("owner", [Settings, *MOTIONS.values(), *ENCODINGS.values()])
+@pytest.mark.parametrize("owner", [Settings, *METHODS.values(), *MOTIONS.values(), *ENCODINGS.values()])
 def test_every_knob_tells_what_it_does(owner):
     for knob in knobs_of(owner).values():
         assert knob.doc.endswith(".")

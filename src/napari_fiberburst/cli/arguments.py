@@ -3,34 +3,23 @@
 import argparse
 from typing import Any, NoReturn
 
-from napari_fiberburst.settings import ENCODINGS, MOTIONS, PRESETS, PUBLISHED_MOTIONS, Settings, choice_docs
-from napari_fiberburst.settings.parameter import Knob, knobs_of
-
-_OWNERS = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
+from napari_fiberburst.settings import ENCODING_NAMES, MOTIONS, PRESETS, all_keywords, choice_docs, owners_of
+from napari_fiberburst.settings.parameter import Knob
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add an option for the preset, the motion, the encoding, and every knob there is."""
     parser.add_argument("--preset", choices=PRESETS, default=next(iter(PRESETS)), help="where settings start from")
-    for part, known in (("motion", MOTIONS), ("encoding", ENCODINGS)):
+    for part, known in (("motion", tuple(MOTIONS)), ("encoding", ENCODING_NAMES)):
         texts = [f"{name}: {text}" for of, name, text in choice_docs() if of == part]
         parser.add_argument(f"--{part}", choices=known, help=" ".join(texts).replace("%", "%%"))
-    owners: dict[str, list[str]] = {}
-    knobs: dict[str, Knob] = {}
-    for owner in _OWNERS:
-        for name, knob in knobs_of(owner).items():
-            knobs.setdefault(name, knob)
-            owners.setdefault(name, []).append(getattr(owner, "name", ""))
-    for name, knob in knobs.items():
-        _add(parser, knob, " and ".join(filter(None, owners[name])))
+    for name, knob in all_keywords().items():
+        _add(parser, knob, " and ".join(choice for _, choice in owners_of(name)))
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return what `napari_fiberburst.settings.choose` takes, from parsed options; unset ones are None."""
-    names = {"preset", "motion", "encoding"}
-    for owner in _OWNERS:
-        names |= set(knobs_of(owner))
-    return {name: getattr(options, name) for name in sorted(names)}
+    return {name: getattr(options, name) for name in sorted({"preset", "motion", "encoding", *all_keywords()})}
 
 
 def parse_crop(text: str) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     from napari_fiberburst.results.progress import Progress
 
     control = Control()
-    with stop_on_interrupt(control), tqdm(total=settings.iterations, unit="it") as bar:
+    with stop_on_interrupt(control), tqdm(total=settings.method.iterations, unit="it") as bar:
 
         def show(report: Progress) -> None:
             bar.total = report.iterations

@@ -5,7 +5,7 @@ from torch import Tensor, nn
 
 from napari_fiberburst.networks.motion import make_motion
 from napari_fiberburst.networks.scene import make_scene
-from napari_fiberburst.settings import Settings
+from napari_fiberburst.settings import TrainedMethod
 
 
 class JointField(nn.Module):
@@ -13,20 +13,24 @@ class JointField(nn.Module):
 
     Parameters
     ----------
-    settings : Settings
-        Motion, encoding and sizes of the networks, and the seed of their start.
+    method : NetworkMethod or PublishedMethod
+        Motion, encoding and sizes of the networks.
     shape : (int, int, int, int)
         Frames, height, width and channels of the burst.
+    seed : int
+        Of the networks' start.
     start : Tensor, optional
         (T, 3, 3) homographies in unit coordinates, from a registration.
     """
 
-    def __init__(self, settings: Settings, shape: tuple[int, int, int, int], start: Tensor | None = None) -> None:
+    def __init__(
+        self, method: TrainedMethod, shape: tuple[int, int, int, int], *, seed: int = 0, start: Tensor | None = None
+    ) -> None:
         super().__init__()
         frames, height, width, channels = shape
-        generator = torch.Generator().manual_seed(settings.seed)
-        self.motion = make_motion(settings.motion, frames, (height, width), generator, start)
-        self.scene = make_scene(settings, self.motion.scene_dimensions, channels, generator)
+        generator = torch.Generator().manual_seed(seed)
+        self.motion = make_motion(method.motion, frames, (height, width), generator, start)
+        self.scene = make_scene(method, self.motion.scene_dimensions, channels, generator)
 
     def forward(self, points: Tensor, frames: Tensor) -> Tensor:
         """Return intensities (N, C) in [-1, 1] at `points` (N, 2), unit coordinates, of frames (N,)."""

@@ -18,7 +18,7 @@ from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.results.reconstruction import Reconstruction, draw
 from napari_fiberburst.scene.image import SplineImage
-from napari_fiberburst.settings import Settings, Spline
+from napari_fiberburst.settings import NetworkMethod, Settings, SplineMethod, TrainedMethod
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
 _CHUNK = 16_384
@@ -149,17 +149,18 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
     )
     reference = int(provenance.get("reference", 0))
     renderer: SplineImage | Representation
-    if isinstance(settings.encoding, Spline):
+    if isinstance(settings.method, SplineMethod):
         renderer = SplineImage.from_arrays(arrays, device)
         homographies = renderer.homographies
     else:
-        renderer = _rebuild_networks(arrays, settings, acquisition, device)
+        renderer = _rebuild_networks(arrays, settings.method, acquisition, device)
         homographies = renderer.homographies()
     return Reconstruction(
         image=draw(renderer, canvas, reference, acquisition),
         canvas=canvas,
         homographies=homographies,
         losses=np.array([np.nan if loss is None else loss for loss in provenance["losses"]], dtype=np.float32),
+        requested=Settings.from_dict(provenance.get("requested", provenance["settings"])),
         settings=settings,
         seconds=float(provenance["seconds"]),
         parameters=int(provenance["parameters"]),
@@ -179,13 +180,13 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
 
 
 def _rebuild_networks(
-    arrays: dict[str, NDArray[Any]], settings: Settings, acquisition: Acquisition, device: torch.device
+    arrays: dict[str, NDArray[Any]], method: TrainedMethod, acquisition: Acquisition, device: torch.device
 ) -> Representation:
     count, height, width, channels = acquisition.shape
     drawn = int(arrays.pop(_DRAWN))
     kept = {name.removeprefix(_BEHIND): arrays.pop(name) for name in list(arrays) if name.startswith(_BEHIND)}
-    start = None if settings.is_published else torch.eye(3).repeat(count, 1, 1)
-    field = JointField(settings, (count, height, width, channels), start)
+    start = torch.eye(3).repeat(count, 1, 1) if isinstance(method, NetworkMethod) else None
+    field = JointField(method, (count, height, width, channels), start=start)
     field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
     behind = SplineImage.from_arrays(kept, device) if kept else None
     return Representation(field.to(device), (height, width), drawn=drawn, behind=behind)

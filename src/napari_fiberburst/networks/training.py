@@ -1,7 +1,7 @@
 """One fit in the making: the joint field, the samples it is fitted to, and Adam."""
 
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,17 +17,17 @@ from napari_fiberburst.networks.batches import Batch, BundleStream, PixelStream
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.motion import AlignedField
-from napari_fiberburst.networks.scene import PUBLISHED_SIGMA
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.scene.image import SplineImage
-from napari_fiberburst.settings import Hash, Settings
+from napari_fiberburst.settings import Encoding, Fourier, Hash, TrainedMethod
 
 # As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
 BATCHES_PER_FRAME = 8
 BETAS = (0.9, 0.999)
-_PUBLISHED_RATE = 1e-4
+# Spread of the Fourier features' frequencies, cycles per pitch: detail between cores is resolved, noise hardly.
+_PERIODS_PER_PITCH = 0.3
 # Behind a bundle model, and started from a registration, larger steps are safe. Grids learn each place by itself.
-_OBSERVED_RATE, _OBSERVED_RATE_OF_GRIDS = 1e-3, 1e-2
+_RATE, _RATE_OF_GRIDS = 1e-3, 1e-2
 # Motion that is right to a part of a pixel takes this part of the scene's step size.
 _PACE_OF_REGISTERED_MOTION = 0.01
 
@@ -47,10 +47,13 @@ class BehindBundle:
         Gains taken out.
     homographies : numpy.ndarray
         (T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are left out.
+    held_out : float
+        Part of the samples that is left out of the fit.
     """
 
     samples: Samples
     homographies: NDArray[np.float64]
+    held_out: float
 
 
 class Problem:
@@ -60,10 +63,12 @@ class Problem:
     ----------
     burst : Burst
         What to explain.
-    settings : Settings
+    method : NetworkMethod or PublishedMethod
         How.
     device : torch.device
         Where.
+    seed : int
+        Of the networks' start and of the order of the samples.
     initial : Reconstruction, optional
         Where to go on from; the samples go on from where its run ended, too.
     behind : BehindBundle, optional
@@ -73,6 +78,11 @@ class Problem:
     ------
     SettingsError
         `initial` stands for another burst or was made with other networks.
+
+    Attributes
+    ----------
+    method : NetworkMethod or PublishedMethod
+        The method with what it left open of its encoding, learning rate and batch chosen.
     """
 
     # Whatever the caller's thread has set, the fit needs gradients, and tensors that can have them.
@@ -80,31 +90,39 @@ class Problem:
     def __init__(
         self,
         burst: Burst,
-        settings: Settings,
+        method: TrainedMethod,
         device: torch.device,
+        *,
+        seed: int = 0,
         initial: Reconstruction | None = None,
-        behind: "BehindBundle | None" = None,
+        behind: BehindBundle | None = None,
     ) -> None:
         _, height, width, _ = burst.shape
         self.frame_shape = (height, width)
         self.samples: PixelStream | BundleStream
         start = None
+        self.batch = method.batch or -(-height * width // BATCHES_PER_FRAME)
         if behind is None:
-            self.samples = PixelStream(burst, device, settings.seed)
-            self.batch = settings.batch or -(-height * width // BATCHES_PER_FRAME)
+            self.samples = PixelStream(burst, device, seed)
         else:
-            self.samples = BundleStream(behind.samples, settings.held_out, settings.seed)
-            self.batch = min(settings.batch or -(-height * width // BATCHES_PER_FRAME), self.samples.count)
+            self.samples = BundleStream(behind.samples, behind.held_out, seed)
+            self.batch = min(self.batch, self.samples.count)
             start = _unit_start(behind)
-        self.field = JointField(settings, burst.shape, start).to(device)
-        self.learning_rate = settings.learning_rate or _usual_rate(settings)
+        self.learning_rate = method.learning_rate or _usual_rate(method)
+        self.method = replace(
+            method,
+            encoding=_following_pitch(method.encoding, behind),
+            learning_rate=self.learning_rate,
+            batch=self.batch,
+        )
+        self.field = JointField(self.method, burst.shape, seed=seed, start=start).to(device)
         registered = isinstance(self.field.motion, AlignedField)
         self._paces = (1.0, _PACE_OF_REGISTERED_MOTION if registered else 1.0)
         parts = [{"params": part.parameters()} for part in (self.field.scene, self.field.motion)]
         self.optimizer = torch.optim.Adam(parts, lr=self.learning_rate, betas=BETAS)
         self.set_learning_rate(self.learning_rate)
         if initial is not None:
-            self._go_on_from(initial, burst, settings)
+            self._go_on_from(initial, burst)
 
     @torch.inference_mode(False)
     def step(self) -> Tensor:
@@ -173,7 +191,7 @@ class Problem:
         state: dict[str, Any] = self.optimizer.state_dict()
         return Representation(self.field, self.frame_shape, state, self.samples.drawn, behind)
 
-    def _go_on_from(self, initial: Reconstruction, burst: Burst, settings: Settings) -> None:
+    def _go_on_from(self, initial: Reconstruction, burst: Burst) -> None:
         start = initial.renderer
         here, there = ({name: getattr(of, name) for name in _IDENTITY} for of in (burst, initial.acquisition))
         if not isinstance(start, Representation) or here != there:
@@ -182,15 +200,15 @@ class Problem:
             self.field.load_state_dict(start.field.state_dict())
         except RuntimeError as error:
             raise SettingsError(
-                f"initial was made with motion {initial.settings.motion} and encoding {initial.settings.encoding}; "
-                f"continue with networks of the same kind and size, not {settings.motion} and {settings.encoding}"
+                f"initial was made with {initial.settings.method}; continue with networks of the same kind and size, "
+                f"not {self.method}"
             ) from error
         if start.optimizer_state is not None:
             self.optimizer.load_state_dict(deepcopy(start.optimizer_state))
             self.set_learning_rate(self.learning_rate)
-        if self.field.scene.has_sigma:
-            sigma = getattr(settings.encoding, "sigma", None)
-            self.field.scene.set_sigma(PUBLISHED_SIGMA if sigma is None else sigma)
+        encoding = self.method.encoding
+        if isinstance(encoding, Fourier) and encoding.sigma is not None:
+            self.field.scene.set_sigma(encoding.sigma)
         self.samples.drawn = start.drawn
 
 
@@ -202,7 +220,12 @@ def _unit_start(behind: BehindBundle) -> Tensor:
     return torch.from_numpy((to_unit @ matrices @ np.linalg.inv(to_unit)).astype(np.float32))
 
 
-def _usual_rate(settings: Settings) -> float:
-    if settings.is_published:
-        return _PUBLISHED_RATE
-    return _OBSERVED_RATE_OF_GRIDS if isinstance(settings.encoding, Hash) else _OBSERVED_RATE
+def _following_pitch(encoding: Encoding, behind: BehindBundle | None) -> Encoding:
+    """Return the encoding with the frequency spread that suits the bundle, where it is left open."""
+    if behind is None or not isinstance(encoding, Fourier) or encoding.sigma is not None:
+        return encoding
+    return replace(encoding, sigma=_PERIODS_PER_PITCH * max(behind.samples.shape) / 2 / behind.samples.pitch)
+
+
+def _usual_rate(method: TrainedMethod) -> float:
+    return _RATE_OF_GRIDS if isinstance(method.encoding, Hash) else _RATE

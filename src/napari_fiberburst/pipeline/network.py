@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.data.canvas import Canvas
@@ -20,18 +21,18 @@ from napari_fiberburst.pipeline.spline import SplineFit
 from napari_fiberburst.pipeline.stages import Fitted
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
-from napari_fiberburst.settings import Fourier, Settings
+from napari_fiberburst.settings import Fourier, NetworkMethod, PublishedMethod, Settings, TrainedMethod
 
 logger = logging.getLogger(__name__)
 
 # Keeping a state copies the networks and Adam's moments.
 _SECONDS_BETWEEN_KEPT_STATES = 1.0
-_PUBLISHED_ITERATIONS, _BUNDLE_ITERATIONS = 3000, 2000
+_ITERATIONS = 2000
+# The error of held-out samples is taken at steps of fixed numbers: the state that is kept must not depend on the clock.
+_STEPS_BETWEEN_EVALUATIONS = 10
 # Early stopping: a fit without an end of its own ends once the error of held-out samples has not improved for this
 # part of its steps.
 _PATIENCE, _LEAST_PATIENCE = 0.4, 150
-# Spread of the Fourier features' frequencies, cycles per pitch: detail between cores is resolved, noise hardly.
-_PERIODS_PER_PITCH = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,38 +40,46 @@ class _Kept:
     """A state to go back to, after `step` steps."""
 
     step: int
-    settings: Settings
+    method: TrainedMethod
     state: State
 
 
 class NetworkFit:
-    """A fit of networks behind the bundle: align, then train; see `napari_fiberburst.pipeline.supervise.Method`.
+    """A fit of networks behind the bundle: align, then train; see `napari_fiberburst.pipeline.supervise.Fit`.
 
     Parameters
     ----------
-    burst, settings, initial, control
-        As in `napari_fiberburst.iterate`.
-    aligned : SplineFit
-        That aligns the burst.
+    burst : Burst
+        What to fit.
+    requested : Settings
+        What was asked for.
+    method : NetworkMethod
+        The method asked for.
+    device : torch.device
+        Where.
+    control, initial, given
+        As control, initial and bundle of `napari_fiberburst.iterate`.
     """
 
     def __init__(
         self,
         burst: Burst,
-        settings: Settings,
+        requested: Settings,
+        method: NetworkMethod,
         device: torch.device,
         control: Control,
         initial: Reconstruction | None,
-        aligned: SplineFit,
+        given: Bundle | None,
     ) -> None:
-        self._burst, self._settings, self._device = burst, settings, device
+        self._burst, self._requested, self._method, self._device = burst, requested, method, device
         self._control, self._initial = control, initial
-        self._aligned = aligned
+        self._aligned = SplineFit(burst, requested, method.alignment, device, given)
         self._training: Training | None = None
 
     def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
         """Align, then train."""
-        yield from self._aligned.align()
+        for snapshot in self._aligned.align():
+            yield None if snapshot is None else replace(snapshot, settings=self._chosen(self._aligned.fitted))
         return (yield from self._start().steps(clock))
 
     def conclude(self, ending: Ending) -> tuple[Snapshot | None, Ending]:
@@ -85,17 +94,50 @@ class NetworkFit:
     def _start(self) -> "Training":
         """Set up the networks where the alignment has come to."""
         fitted = self._aligned.round_off()
-        settings = _following_pitch(self._settings, fitted)
-        self._training = Training(self._burst, settings, self._device, self._control, self._initial, fitted)
+        assert fitted.samples is not None
+        behind = BehindBundle(fitted.samples, fitted.registration.reference_from_frame, self._method.held_out)
+        method = replace(self._method, samples=fitted.samples.kind)
+        problem = Problem(
+            self._burst, method, self._device, seed=self._requested.seed, initial=self._initial, behind=behind
+        )
+        self._training = Training(
+            self._burst, self._requested, problem, self._device, self._control, self._initial, fitted
+        )
         return self._training
+
+    def _chosen(self, fitted: Fitted) -> Settings:
+        """Return the settings with all that the alignment has chosen."""
+        samples = self._method.samples if fitted.samples is None else fitted.samples.kind
+        return replace(self._requested, method=replace(self._method, samples=samples), device=str(self._device))
+
+
+def published(
+    burst: Burst,
+    requested: Settings,
+    method: PublishedMethod,
+    device: torch.device,
+    control: Control,
+    initial: Reconstruction | None,
+) -> "Training":
+    """Return a fit of networks to the frames as they are; the parameters are those of `NetworkFit`."""
+    problem = Problem(burst, method, device, seed=requested.seed, initial=initial)
+    return Training(burst, requested, problem, device, control, initial)
 
 
 class Training:
-    """Steps of Adam on a burst as published, or behind its bundle; see `napari_fiberburst.pipeline.supervise.Method`.
+    """Steps of Adam on a burst as published, or behind its bundle; see `napari_fiberburst.pipeline.supervise.Fit`.
 
     Parameters
     ----------
-    burst, settings, initial, control
+    burst : Burst
+        What is fitted.
+    requested : Settings
+        What was asked for.
+    problem : Problem
+        The networks in the making.
+    device : torch.device
+        Where.
+    control, initial
         As in `napari_fiberburst.iterate`.
     fitted : Fitted, optional
         The burst, calibrated and registered, with a first picture; without, it is fitted as published.
@@ -104,31 +146,28 @@ class Training:
     def __init__(
         self,
         burst: Burst,
-        settings: Settings,
+        requested: Settings,
+        problem: Problem,
         device: torch.device,
         control: Control,
         initial: Reconstruction | None,
         fitted: Fitted | None = None,
     ) -> None:
-        self._burst, self._device, self._control, self._initial = burst, device, control, initial
-        self._fitted = fitted
-        behind = None
-        if fitted is not None:
-            assert fitted.samples is not None
-            behind = BehindBundle(fitted.samples, fitted.registration.reference_from_frame)
-        self._problem = Problem(burst, settings, device, initial, behind)
-        self._settings = replace(settings, learning_rate=self._problem.learning_rate)
+        self._burst, self._requested, self._device, self._control = burst, requested, device, control
+        self._initial, self._fitted, self._problem = initial, fitted, problem
         bounds = (0, 0, burst.shape[2], burst.shape[1])
-        self._canvas = Canvas.over(bounds, settings.upsample) if fitted is None else fitted.canvas
-        self._iterations = settings.iterations or (_PUBLISHED_ITERATIONS if fitted is None else _BUNDLE_ITERATIONS)
+        self._canvas = Canvas.over(bounds, problem.method.upsample) if fitted is None else fitted.canvas
+        self._has_open_end = problem.method.iterations is None
+        self._iterations = problem.method.iterations or _ITERATIONS
+        self._before = 0 if initial is None else len(initial.losses)
+        self._method: TrainedMethod = replace(problem.method, iterations=self._before + self._iterations)
         self._best: tuple[float, _Kept] | None = None
         self._losses: list[float] = []
         self._pending: list[Tensor] = []
-        self._kept: tuple[_Kept, ...] = (_Kept(0, self._settings, self._problem.state()),)
+        self._kept: tuple[_Kept, ...] = (_Kept(0, self._method, self._problem.state()),)
         self._kept_at = 0.0
         self._live_sigma: float | None = None
         self._image: NDArray[np.float32] | None = None
-        self._has_open_end = settings.iterations is None
         self._step = 0
 
     def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
@@ -140,16 +179,15 @@ class Training:
             self._step += 1
             if self._step == 1:
                 clock.start_steps()
+            if self._step % _STEPS_BETWEEN_EVALUATIONS == 1 and self._evaluate_held_out():
+                break
             is_due = (self._step == 1 or clock.is_report_due()) and self._step < self._iterations
             if not is_due:
                 yield None
                 continue
             if not self._check_and_keep(clock):
                 return "diverged"
-            has_converged = self._evaluate_held_out()
             yield self._snapshot()
-            if has_converged:
-                break
         return "finished"
 
     def conclude(self, ending: Ending) -> tuple[Snapshot | None, Ending]:
@@ -166,6 +204,8 @@ class Training:
         else:
             ending = "diverged"
             self._image = self._draw()
+        if self._before + self._step:
+            self._method = replace(self._method, iterations=self._before + self._step)
         return (self._snapshot() if self._step else None), ending
 
     def result(self, ending: Ending, seconds: float) -> Reconstruction:
@@ -179,6 +219,7 @@ class Training:
             canvas=self._canvas,
             homographies=representation.homographies(),
             losses=losses if before is None else np.concatenate([before.losses, losses]),
+            requested=self._requested,
             settings=self._settings,
             seconds=seconds + (0.0 if before is None else before.seconds),
             parameters=self._problem.field.parameter_count,
@@ -208,16 +249,16 @@ class Training:
     def _follow(self) -> None:
         """Take over what a user has changed since the last step."""
         rate, sigma = self._control.learning_rate, self._control.sigma
-        if rate is not None and rate != self._settings.learning_rate:
+        if rate is not None and rate != self._method.learning_rate:
             self._problem.set_learning_rate(rate)
-            self._settings = replace(self._settings, learning_rate=rate)
+            self._method = replace(self._method, learning_rate=rate)
         if sigma is None or sigma == self._live_sigma:
             return
         self._live_sigma = sigma
-        encoding = self._settings.encoding
+        encoding = self._method.encoding
         if isinstance(encoding, Fourier):
             self._problem.field.scene.set_sigma(sigma)
-            self._settings = replace(self._settings, encoding=replace(encoding, sigma=sigma))
+            self._method = replace(self._method, encoding=replace(encoding, sigma=sigma))
         else:
             logger.warning("sigma %g has no effect: encoding %s has no frequency spread", sigma, encoding.name)
 
@@ -230,19 +271,24 @@ class Training:
             self._go_back()
             return False
         if clock is not None and clock.seconds - self._kept_at >= _SECONDS_BETWEEN_KEPT_STATES:
-            self._kept = (self._kept[-1], _Kept(self._step, self._settings, self._problem.state()))
+            self._kept = (self._kept[-1], _Kept(self._step, self._method, self._problem.state()))
             self._kept_at = clock.seconds
         return True
 
     def _evaluate_held_out(self) -> bool:
         """Take the error of held-out samples, keep the state where it is the least; return whether it has converged."""
         error = self._problem.sample_error()
-        if error is None:
+        if error is None or not np.isfinite(error):
             return False
         if self._best is None or error < self._best[0]:
-            self._best = (error, _Kept(self._step, self._settings, self._problem.state()))
+            self._best = (error, _Kept(self._step, self._method, self._problem.state()))
         waited = self._step - self._best[1].step
         return self._has_open_end and waited > max(_LEAST_PATIENCE, _PATIENCE * self._step)
+
+    @property
+    def _settings(self) -> Settings:
+        """What was asked for, with all that has been chosen."""
+        return replace(self._requested, method=self._method, device=str(self._device))
 
     def _snapshot(self) -> Snapshot:
         return Snapshot(
@@ -276,22 +322,13 @@ class Training:
             "the fit stopped giving numbers by step %d; going back to step %d; a learning rate lower than %g may help",
             self._step,
             back.step,
-            self._settings.learning_rate or 0.0,
+            self._method.learning_rate or 0.0,
         )
         self._problem.restore(back.state)
-        self._settings = back.settings
+        self._method = back.method
         self._losses = self._losses[: back.step]
         self._step = back.step
 
     def _draw(self) -> NDArray[np.float32]:
         reference = 0 if self._fitted is None else self._fitted.registration.reference
         return draw(self._representation(), self._canvas, reference, self._burst)
-
-
-def _following_pitch(settings: Settings, fitted: Fitted) -> Settings:
-    """Return the settings with the frequency spread that suits the bundle, where it is left open."""
-    encoding = settings.encoding
-    if not isinstance(encoding, Fourier) or encoding.sigma is not None:
-        return settings
-    sigma = _PERIODS_PER_PITCH * max(fitted.bundle.shape) / 2 / fitted.bundle.pitch
-    return replace(settings, encoding=replace(encoding, sigma=sigma))

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, assert_never
 
 from numpy.typing import ArrayLike
 
@@ -13,18 +13,26 @@ from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
-from napari_fiberburst.pipeline.network import NetworkFit, Training
+from napari_fiberburst.pipeline.network import NetworkFit, published
 from napari_fiberburst.pipeline.spline import SplineFit
-from napari_fiberburst.pipeline.supervise import Method, supervise
+from napari_fiberburst.pipeline.supervise import Fit, supervise
 from napari_fiberburst.results.progress import Progress
 from napari_fiberburst.results.reconstruction import Reconstruction
-from napari_fiberburst.settings import Encoding, Motion, Settings, Spline, choose
+from napari_fiberburst.settings import (
+    Encoding,
+    Motion,
+    NetworkMethod,
+    PublishedMethod,
+    Settings,
+    SplineMethod,
+    choose,
+)
 
 
 def reconstruct(
     frames: Burst | ArrayLike | str | Path,
     *,
-    preset: str = "auto",
+    preset: str | Settings = "auto",
     motion: str | Motion | None = None,
     encoding: str | Encoding | None = None,
     sigma: float | None = None,
@@ -46,9 +54,9 @@ def reconstruct(
     ----------
     frames : Burst, array_like or path
         (T, H, W) or (T, H, W, C); a path is opened by `napari_fiberburst.read_burst`.
-    preset : str
+    preset : str or Settings
         Where settings come from that are None here: "auto" calibrates the bundle from the burst, registers the frames
-        and solves the scene; "paper" is the published method.
+        and solves the scene; "paper" is the published method; or settings, such as those of another result.
     motion : str or Motion, optional
         "translation", "similarity", "affine", "homography", "none", "flow" or "flow_tv", or a settings object.
     encoding : str or Encoding, optional
@@ -82,7 +90,7 @@ def reconstruct(
         exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
         Adam's moments start anew.
     **more
-        Any other field of `Settings`, or of the motion or the encoding chosen, by name: ``learning_rate=1e-3``,
+        Any other knob of `Settings`, or of the method, motion or encoding chosen, by name: ``learning_rate=1e-3``,
         ``features=128``, ``preview_every=1.0``.
 
     Returns
@@ -206,26 +214,29 @@ def iterate(
     if not isinstance(control, Control):
         raise SettingsError(f"control must be a napari_fiberburst.Control; got {control!r}")
     _check_bundle(settings, bundle)
-    if settings.is_published:
-        device = find_device(settings.device)
-        method: Method = Training(burst, settings, device, control, initial)
-    else:
-        is_spline = isinstance(settings.encoding, Spline)
-        if is_spline and initial is not None:
-            raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
-        device = find_device(settings.device)
-        fit = SplineFit(burst, settings, device, bundle)
-        method = fit if is_spline else NetworkFit(burst, settings, device, control, initial, fit)
-    return (yield from supervise(method, settings, control, should_stop))
+    if isinstance(settings.method, SplineMethod) and initial is not None:
+        raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
+    device = find_device(settings.device)
+    fit: Fit
+    match settings.method:
+        case SplineMethod() as method:
+            fit = SplineFit(burst, settings, method, device, bundle)
+        case NetworkMethod() as method:
+            fit = NetworkFit(burst, settings, method, device, control, initial, bundle)
+        case PublishedMethod() as method:
+            fit = published(burst, settings, method, device, control, initial)
+        case _:
+            assert_never(settings.method)
+    return (yield from supervise(fit, settings, control, should_stop))
 
 
 def _check_bundle(settings: Settings, bundle: object) -> None:
-    if settings.is_published and bundle is not None:
+    if isinstance(settings.method, PublishedMethod) and bundle is not None:
         raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
 
 
 def _continued(initial: Reconstruction, seed: int | None) -> tuple[Settings, None]:
-    """Return the settings to go on with; the seed is among them, for it has drawn the frequencies."""
+    """Return the settings to go on with; the seed is among them, because it has drawn the frequencies."""
     if not isinstance(initial, Reconstruction):
         raise SettingsError(
             f"initial must be a Reconstruction, such as napari_fiberburst.load returns; got {initial!r}"
@@ -234,5 +245,8 @@ def _continued(initial: Reconstruction, seed: int | None) -> tuple[Settings, Non
         raise SettingsError(
             f"a continued run keeps its seed, {initial.settings.seed}; got {seed}; leave it out, or start anew"
         )
-    # How long to run and what to show belong to the run, not to what it has made.
-    return replace(initial.settings, time_budget=None, preview_every=None), None
+    # How long to run, where, and what to show belong to the run, not to what it has made.
+    asked: dict[str, Any] = {"iterations": initial.requested.method.iterations}
+    method = replace(initial.settings.method, **asked)
+    device = initial.requested.device
+    return replace(initial.settings, method=method, device=device, time_budget=None, preview_every=None), None

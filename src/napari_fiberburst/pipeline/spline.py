@@ -12,28 +12,34 @@ from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.stages import Fitted, Stages
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
-from napari_fiberburst.settings import Settings, Spline
+from napari_fiberburst.settings import Settings, SplineMethod
 
 # Rounds and stages that a fit has, about: what is left is counted in these.
 _PLANNED = 27
 
 
 class SplineFit:
-    """A fit by stages; see `napari_fiberburst.pipeline.supervise.Method`.
+    """A fit by stages; see `napari_fiberburst.pipeline.supervise.Fit`.
 
     Parameters
     ----------
-    burst, settings
-        What to fit, and how.
+    burst : Burst
+        What to fit.
+    requested : Settings
+        What was asked for.
+    method : SplineMethod
+        How to fit it: the method asked for, or the alignment of a network's.
     device : torch.device
         Where.
     given : Bundle, optional
         The bundle, where it is known.
     """
 
-    def __init__(self, burst: Burst, settings: Settings, device: torch.device, given: Bundle | None) -> None:
-        self._burst, self._settings, self._device = burst, settings, device
-        self._stages = Stages(burst, settings, device, given)
+    def __init__(
+        self, burst: Burst, requested: Settings, method: SplineMethod, device: torch.device, given: Bundle | None
+    ) -> None:
+        self._burst, self._requested, self._method, self._device = burst, requested, method, device
+        self._stages = Stages(burst, method, device, seed=requested.seed, given=given)
         self._losses: list[float] = []
         self._fitted: Fitted | None = None
 
@@ -57,7 +63,7 @@ class SplineFit:
         """Draw what there is."""
         if ending != "finished":
             self.round_off()
-        return self._snapshot(None), ending
+        return self._snapshot(None, is_last=True), ending
 
     def round_off(self) -> Fitted:
         """Make what is known belong together, with a first picture of it."""
@@ -78,7 +84,8 @@ class SplineFit:
             canvas=fitted.canvas,
             homographies=fitted.registration.reference_from_frame,
             losses=np.array(self._losses, dtype=np.float32),
-            settings=self._chosen(fitted),
+            requested=self._requested,
+            settings=self._chosen(fitted, is_last=True),
             seconds=seconds,
             parameters=image.parameters,
             device=str(self._device),
@@ -99,7 +106,7 @@ class SplineFit:
                 return self.fitted
             yield None if self._fitted is None else self._snapshot(before)
 
-    def _snapshot(self, before: Fitted | None) -> Snapshot:
+    def _snapshot(self, before: Fitted | None, *, is_last: bool = False) -> Snapshot:
         """Return a snapshot, with the picture where it is another one than before."""
         fitted = self.fitted
         image = fitted.image
@@ -113,7 +120,7 @@ class SplineFit:
             planned=max(_PLANNED, step + 1),
             loss=self._losses[-1],
             homographies=fitted.registration.reference_from_frame,
-            settings=self._chosen(fitted),
+            settings=self._chosen(fitted, is_last=is_last),
             canvas=fitted.canvas,
             draw=(lambda: draw(image, fitted.canvas, fitted.registration.reference, self._burst))
             if image is not None and is_new
@@ -122,9 +129,14 @@ class SplineFit:
             held_out_rmse=None if error is None else error * (self._burst.white_level - self._burst.black_level),
         )
 
-    def _chosen(self, fitted: Fitted) -> Settings:
-        """Return the settings, with the smoothness that was chosen."""
-        scene = fitted.scene
-        if scene is None or scene.is_draft or not isinstance(self._settings.encoding, Spline):
-            return self._settings
-        return replace(self._settings, encoding=Spline(smoothness=scene.smoothness))
+    def _chosen(self, fitted: Fitted, *, is_last: bool) -> Settings:
+        """Return the settings with all that has been chosen; at the end that is all that was left open."""
+        method = self._method
+        if fitted.samples is not None:
+            method = replace(method, samples=fitted.samples.kind)
+        # The smoothness of a draft is a usual one, which may be chosen yet.
+        if fitted.scene is not None and (is_last or not fitted.scene.is_draft):
+            method = replace(method, smoothness=fitted.scene.smoothness)
+        if is_last:
+            method = replace(method, iterations=fitted.registration.rounds or method.iterations or 1)
+        return replace(self._requested, method=method, device=str(self._device))

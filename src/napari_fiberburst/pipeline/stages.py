@@ -23,7 +23,7 @@ from napari_fiberburst.motion.registration import Registration, refining, regist
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.scene.solve import Scene, solve_quickly, solving
-from napari_fiberburst.settings import Settings, Spline
+from napari_fiberburst.settings import SplineMethod
 
 logger = logging.getLogger(__name__)
 
@@ -72,16 +72,18 @@ class Fitted:
 
 
 class Stages:
-    """The steps for one burst and its settings.
+    """The steps for one burst.
 
     Parameters
     ----------
     burst : Burst
         The frames.
-    settings : Settings
+    method : SplineMethod
         How.
     device : torch.device
         Where.
+    seed : int
+        Of the samples that the first rounds use, and of those that are left out.
     given : Bundle, optional
         The bundle, where it is known.
 
@@ -91,14 +93,16 @@ class Stages:
         There is a single frame, and no bundle.
     """
 
-    def __init__(self, burst: Burst, settings: Settings, device: torch.device, given: Bundle | None) -> None:
+    def __init__(
+        self, burst: Burst, method: SplineMethod, device: torch.device, *, seed: int = 0, given: Bundle | None = None
+    ) -> None:
         if burst.shape[0] < 2 and given is None:
             raise BurstError(
                 "one frame is a burst only where its bundle is known, because nothing in it tells bundle and object "
                 "apart; give a bundle (Bundle.from_image, or reconstruct(burst).bundle), or open at least 2 frames as "
                 "one (time, height, width) stack"
             )
-        self._burst, self._settings, self._given = burst, settings, given
+        self._burst, self._method, self._seed, self._given = burst, method, seed, given
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = self._frames.mean(dim=3)
 
@@ -115,14 +119,14 @@ class Stages:
         """Solve the scene for the bundle and motion as they are."""
         samples = self._in_colour(fitted)
         fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
-        grid = self._grid(1 / self._settings.upsample, fitted)
+        grid = self._grid(1 / self._method.upsample, fitted)
         steps = solving(
             samples,
             fitted.registration,
             grid,
-            smoothness=self._smoothness,
-            held_out=self._settings.held_out,
-            seed=self._settings.seed,
+            smoothness=self._method.smoothness,
+            held_out=self._method.held_out,
+            seed=self._seed,
         )
         while True:
             try:
@@ -171,9 +175,9 @@ class Stages:
         """Find the motion by whole cores, with a picture on the way and at the end."""
         steps = registering(
             samples,
-            dof=self._settings.motion.dof,
-            iterations=self._iterations,
-            seed=self._settings.seed,
+            dof=self._method.motion.dof,
+            iterations=self._method.iterations,
+            seed=self._seed,
         )
         while True:
             try:
@@ -221,9 +225,9 @@ class Stages:
         steps = refining(
             samples,
             registration,
-            dof=self._settings.motion.dof,
-            iterations=self._iterations,
-            seed=self._settings.seed,
+            dof=self._method.motion.dof,
+            iterations=self._method.iterations,
+            seed=self._seed,
         )
         while True:
             try:
@@ -243,8 +247,8 @@ class Stages:
 
     def _kind(self, bundle: Bundle, registration: Registration) -> str:
         """Return whether cores or pixels are the samples: as asked for, or as the burst itself shows."""
-        if self._settings.observation != "auto":
-            return self._settings.observation
+        if self._method.samples != "auto":
+            return self._method.samples
         if not bundle.is_resolved:
             return "pixels"
         if registration.is_still:
@@ -264,8 +268,8 @@ class Stages:
         """Solve a coarse picture of all that is known so far."""
         samples = self._in_colour(fitted)
         fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
-        spacing = max(_PREVIEW_SPACING / self._settings.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
-        scene = solve_quickly(samples, fitted.registration, self._grid(spacing, fitted), self._smoothness)
+        spacing = max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
+        scene = solve_quickly(samples, fitted.registration, self._grid(spacing, fitted), self._method.smoothness)
         return self._with_scene(fitted, scene)
 
     def _with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
@@ -277,7 +281,7 @@ class Stages:
             grid=scene.grid,
             known=scene.equations.density() > _LEAST_DENSITY,
             reach=fitted.bundle.pitch,
-            fill=self._settings.fill,
+            fill=self._method.fill,
             homographies=fitted.registration.reference_from_frame,
             black=self._black(fitted.bundle),
         )
@@ -287,29 +291,19 @@ class Stages:
         levels = self._burst
         return (bundle.black - levels.black_level) / (levels.white_level - levels.black_level)
 
-    @property
-    def _iterations(self) -> int | None:
-        """Iterations of registration at most: for a network, `iterations` counts its steps instead."""
-        return self._settings.iterations if isinstance(self._settings.encoding, Spline) else None
-
-    @property
-    def _smoothness(self) -> float | None:
-        encoding = self._settings.encoding
-        return encoding.smoothness if isinstance(encoding, Spline) else None
-
     def _frame_canvas(self) -> Canvas:
-        return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]), self._settings.upsample)
+        return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]), self._method.upsample)
 
     def _canvas(self, registration: Registration, samples: Samples) -> Canvas:
         """Lay the canvas over the reference frame, or over all that any frame saw."""
-        if self._settings.canvas == "frame":
+        if self._method.canvas == "frame":
             return self._frame_canvas()
         points = registration.points(samples.positions)[samples.weights > 0]
         points = points[torch.isfinite(points).all(dim=1)]
         low, high = points.amin(dim=0).floor().tolist(), points.amax(dim=0).ceil().tolist()
         most = _MOST_FIELDS * max(self._burst.shape[1:3])
         low, high = ([min(max(edge, -most), most) for edge in corner] for corner in (low, high))
-        return Canvas.over((low[0], low[1], high[0] + 1, high[1] + 1), self._settings.upsample)
+        return Canvas.over((low[0], low[1], high[0] + 1, high[1] + 1), self._method.upsample)
 
     def _grid(self, spacing: float, fitted: Fitted) -> Grid:
         """Return a grid over the canvas and some more, its nodes on pixel centres where the spacing is a pixel's."""

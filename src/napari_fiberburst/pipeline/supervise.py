@@ -93,7 +93,7 @@ class Clock:
         return (step - 1) / max(self.seconds - self._first_step, 1e-9) if step > 1 else 0.0
 
 
-class Method(Protocol):
+class Fit(Protocol):
     """A way to fit a burst, in steps."""
 
     def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
@@ -110,16 +110,16 @@ class Method(Protocol):
 
 
 def supervise(
-    method: Method, settings: Settings, control: Control, should_stop: Callable[[], bool] | None
+    fit: Fit, settings: Settings, control: Control, should_stop: Callable[[], bool] | None
 ) -> Generator[Progress, None, Reconstruction]:
-    """Run a method until it is done, stopped or out of time, and report while it runs.
+    """Run a fit until it is done, stopped or out of time, and report while it runs.
 
     A stop, a pause and the time budget take effect between any two steps, those of calibration included. The budget
     leaves time for one step.
     """
     clock = Clock()
     previews = _Previews(settings.preview_every)
-    steps = method.steps(clock)
+    steps = fit.steps(clock)
     ending: Ending = "finished"
     is_started = False
     while True:
@@ -142,11 +142,11 @@ def supervise(
             is_started = True
         if snapshot is not None:
             yield _progress(snapshot, clock, settings, previews.taken(snapshot, clock))
-    last, ending = method.conclude(ending)
+    last, ending = fit.conclude(ending)
     if last is not None:
         preview = None if last.draw is None or settings.preview_every is None else last.draw()
         yield _progress(last, clock, settings, preview, is_last=True)
-    return method.result(ending, clock.seconds)
+    return fit.result(ending, clock.seconds)
 
 
 def _progress(

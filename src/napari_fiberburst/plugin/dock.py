@@ -33,7 +33,7 @@ from napari_fiberburst.plugin.preferences import preferences, remember, remember
 from napari_fiberburst.plugin.runner import Runner
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
 from napari_fiberburst.plugin.sections import row_of
-from napari_fiberburst.settings import Spline, choose
+from napari_fiberburst.settings import SplineMethod, choose
 
 if TYPE_CHECKING:
     import napari
@@ -145,7 +145,7 @@ class FiberBurstWidget(QWidget):
         told = {"run": name, "burst": source.name, "choices": choices, "python": python}
         initial = None if after is None else after.result
         settings = choose(**choices) if initial is None else initial.settings
-        self._is_network = not isinstance(settings.encoding, Spline)
+        self._is_network = not isinstance(settings.method, SplineMethod)
         self._preferences = preferences()
         layers = RunLayers(self._viewer, name, placement, told)
         job = Job(

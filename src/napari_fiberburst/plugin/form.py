@@ -10,15 +10,13 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.plugin.knob_rows import KnobRow
 from napari_fiberburst.plugin.sections import form_layout, section
 from napari_fiberburst.settings import (
-    ENCODINGS,
-    MOTIONS,
+    ENCODING_NAMES,
     PRESETS,
-    PUBLISHED_MOTIONS,
     Settings,
+    all_keywords,
     choice_docs,
     choose,
 )
-from napari_fiberburst.settings.parameter import Knob, knobs_of
 
 # Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides.
 _FIRST = ("sigma", "smoothness", "iterations", "time_budget", "device", "canvas", "upsample")
@@ -49,7 +47,7 @@ class SettingsForm(QWidget):
         self._preset, self._motion, self._encoding = (QComboBox() for _ in range(3))
         self._device = QComboBox()
         self._device.addItems(_DEVICES)
-        knobs = _all_knobs()
+        knobs = all_keywords()
         self._device.setToolTip(knobs.pop("device").doc)
         self._rows = {name: KnobRow(knob, self) for name, knob in knobs.items() if name not in _NOT_SHOWN}
         self._first, self._rest = form_layout(), form_layout()
@@ -75,11 +73,11 @@ class SettingsForm(QWidget):
         preset = PRESETS[self.preset]
         named: dict[str, Any] = {} if self.preset == next(iter(PRESETS)) else {"preset": self.preset}
         observation = self._rows["observation"].value
-        if observation != preset.observation:
+        if observation != preset.value_of("observation"):
             named["observation"] = observation
         start = choose(**{"preset": self.preset, **named})
         for part, box in (("motion", self._motion), ("encoding", self._encoding)):
-            if box.currentText() != getattr(start, part).name:
+            if box.currentText() != start.flat()[part]:
                 named[part] = box.currentText()
         base = choose(**named)
         values = {name: self._value(name) for name in base.knobs if name not in (*_NOT_SHOWN, "observation")}
@@ -124,7 +122,7 @@ class SettingsForm(QWidget):
         for box, part, names in (
             (self._preset, "preset", PRESETS),
             (self._motion, "motion", ()),
-            (self._encoding, "encoding", ENCODINGS),
+            (self._encoding, "encoding", ENCODING_NAMES),
         ):
             for name in names:
                 box.addItem(name)
@@ -175,14 +173,13 @@ class SettingsForm(QWidget):
         named = {"motion": self._motion.currentText(), "encoding": self._encoding.currentText()}
         observation = self._rows["observation"].value
         try:
-            if (observation == "frames") != self._settings.is_published:
+            if (observation == "frames") != (self._settings.value_of("observation") == "frames"):
                 # The other family of motions comes with its own values.
                 self._show(choose(self.preset, observation=observation))
             else:
                 base = choose(self._settings, **named)
-                changed = base.encoding.name != self._settings.encoding.name
-                changed |= base.motion.name != self._settings.motion.name
-                if changed:
+                before = self._settings.flat()
+                if any(before[part] != chosen for part, chosen in named.items()):
                     self._show(choose(base, **self._shared(base)))
             self.choices()
             self.problem = ""
@@ -208,6 +205,7 @@ class SettingsForm(QWidget):
     def _show(self, settings: Settings) -> None:
         """Take the form to settings, and show only their knobs."""
         self._settings = settings
+        flat = settings.flat()
         for box in (self._motion, self._encoding, self._device):
             box.blockSignals(True)
         self._motion.clear()
@@ -215,8 +213,8 @@ class SettingsForm(QWidget):
         for name in settings.motions:
             self._motion.addItem(name)
             self._motion.setItemData(self._motion.count() - 1, texts.get(name, ""), Qt.ItemDataRole.ToolTipRole)
-        self._motion.setCurrentText(settings.motion.name)
-        self._encoding.setCurrentText(settings.encoding.name)
+        self._motion.setCurrentText(flat["motion"])
+        self._encoding.setCurrentText(flat["encoding"])
         if self._device.findText(settings.device) < 0:
             self._device.addItem(settings.device)
         self._device.setCurrentText(settings.device)
@@ -227,17 +225,11 @@ class SettingsForm(QWidget):
                 row = layout.itemAt(number, QFormLayout.ItemRole.FieldRole).widget()
                 if isinstance(row, KnobRow):
                     layout.setRowVisible(number, row.knob.name in settings.knobs)
-        named = {"motion": settings.motion.name, "encoding": settings.encoding.name}
-        base = choose(self.preset, observation=settings.observation, **named)
+        base = choose(self.preset, **{name: flat[name] for name in ("observation", "motion", "encoding")})
         for name in settings.knobs:
             if name in self._rows:
-                self._rows[name].set_value(settings.value_of(name))
+                self._rows[name].set_value(flat[name])
                 self._rows[name].allow_open(base.value_of(name) is None)
 
     def _value(self, name: str) -> Any:
         return self._device.currentText() if name == "device" else self._rows[name].value
-
-
-def _all_knobs() -> dict[str, Knob]:
-    owners = (Settings, *{**MOTIONS, **PUBLISHED_MOTIONS}.values(), *ENCODINGS.values())
-    return {name: knob for owner in owners for name, knob in knobs_of(owner).items()}

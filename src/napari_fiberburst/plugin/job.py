@@ -167,7 +167,8 @@ class Job:
         """Compare with the truth where there is one and a picture, now and then."""
         began = time.perf_counter()
         is_soon = began - self._scored < self._scoring / _SCORING_SHARE and report.remaining != 0
-        if self._truth is None or report.preview is None or report.settings.canvas != "frame" or is_soon:
+        is_frame = report.settings.flat().get("canvas", "frame") == "frame"
+        if self._truth is None or report.preview is None or not is_frame or is_soon:
             return None
         if not np.allclose(report.homographies[0], np.eye(3), atol=1e-6):
             return None  # the picture is over another frame, for frame 0 is of no use

@@ -111,7 +111,8 @@ class KnobRow(QWidget):
         """Say what an open knob has come to in a run."""
         if self._auto is None or not self._auto.isChecked():
             return
-        self._auto.setText("auto" if value is None else f"auto ({value:.3g})")
+        number = f"{value:.3g}" if isinstance(value, float) else f"{value}"
+        self._auto.setText("auto" if value is None else f"auto ({number})")
         if value is not None:
             self._editor.blockSignals(True)
             _set(self._editor, value)

@@ -26,7 +26,7 @@ from napari_fiberburst.plugin.history import History
 from napari_fiberburst.plugin.job import Scores
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.sections import row_of
-from napari_fiberburst.settings import Spline
+from napari_fiberburst.settings import SplineMethod
 
 if TYPE_CHECKING:
     from napari.layers import Layer
@@ -230,7 +230,7 @@ class RunsPanel(QWidget):
             self._other.setCurrentIndex(others.index(before))
         self._other.blockSignals(False)
         self._compare.setEnabled(bool(others))
-        is_network = has_result and not isinstance(run.result.settings.encoding, Spline)
+        is_network = has_result and not isinstance(run.result.settings.method, SplineMethod)
         self._continue.setEnabled(is_network and not self._is_running)
         self._more_steps.setEnabled(is_network and not self._is_running)
         self._continue.setToolTip(

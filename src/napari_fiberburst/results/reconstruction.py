@@ -62,8 +62,12 @@ class Reconstruction(Diagnostics):
     losses : numpy.ndarray
         (steps,) float32, each step's mean squared error with intensities in [-1, 1], plus the motion's prior; the
         steps of the run it continued are in front.
+    requested : Settings
+        What was asked for.
     settings : Settings
-        What it was made with.
+        What it was made with: all that was left open is chosen (`Settings.left_open` is empty), `iterations` are the
+        steps or rounds that were done, those of a run it continued included. Where not even one was done, they are
+        those that were planned.
     seconds : float
         Time from the first step on, pauses left out, the run it continued included.
     parameters : int
@@ -89,6 +93,7 @@ class Reconstruction(Diagnostics):
     canvas: Canvas
     homographies: NDArray[np.float64]
     losses: NDArray[np.float32]
+    requested: Settings
     settings: Settings
     seconds: float
     parameters: int
@@ -178,6 +183,7 @@ class Reconstruction(Diagnostics):
     def provenance(self) -> dict[str, Any]:
         """Return where the picture came from, as plain values that JSON can hold; None stands for NaN."""
         return {
+            "requested": self.requested.to_dict(),
             "settings": self.settings.to_dict(),
             "seed": self.settings.seed,
             "device": self.device,

@@ -9,6 +9,7 @@ from napari_fiberburst.settings.choices import (
     Flow,
     FlowTV,
     Fourier,
+    FrameMotion,
     Hash,
     Homography,
     HomographyNetwork,
@@ -16,15 +17,27 @@ from napari_fiberburst.settings.choices import (
     NeRF,
     NoEncoding,
     NoMotion,
+    PublishedMotion,
     Similarity,
     Siren,
-    Spline,
     Translation,
 )
-from napari_fiberburst.settings.settings import PRESETS, Settings, choice_docs, choose
+from napari_fiberburst.settings.keywords import ENCODING_NAMES, owners_of
+from napari_fiberburst.settings.methods import (
+    METHODS,
+    Method,
+    NetworkMethod,
+    PublishedMethod,
+    SplineMethod,
+    TrainedMethod,
+)
+from napari_fiberburst.settings.presets import PRESETS, all_keywords, choice_docs, choose
+from napari_fiberburst.settings.settings import Settings
 
 __all__ = [
     "ENCODINGS",
+    "ENCODING_NAMES",
+    "METHODS",
     "MOTIONS",
     "PRESETS",
     "PUBLISHED_MOTIONS",
@@ -33,18 +46,26 @@ __all__ = [
     "Flow",
     "FlowTV",
     "Fourier",
+    "FrameMotion",
     "Hash",
     "Homography",
     "HomographyNetwork",
+    "Method",
     "Motion",
     "NeRF",
+    "NetworkMethod",
     "NoEncoding",
     "NoMotion",
+    "PublishedMethod",
+    "PublishedMotion",
     "Settings",
     "Similarity",
     "Siren",
-    "Spline",
+    "SplineMethod",
+    "TrainedMethod",
     "Translation",
+    "all_keywords",
     "choice_docs",
     "choose",
+    "owners_of",
 ]

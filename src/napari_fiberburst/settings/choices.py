@@ -1,4 +1,4 @@
-"""What a user can choose between: how the scene is held, and how the object moves. Standard library only."""
+"""What a method is made of: how a network is shown coordinates, and how the object moves. Standard library only."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,22 +66,6 @@ class Siren:
 
     name: ClassVar[str] = "siren"
     omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4)
-
-    def __post_init__(self) -> None:
-        check(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Spline:
-    """A linear spline instead of a network, solved rather than trained: the fastest, and here the sharpest."""
-
-    name: ClassVar[str] = "spline"
-    smoothness: float | None = knob(
-        None,
-        "Weight of the smoothness prior; more is smoother and less noisy. None lets two halves of the burst choose.",
-        above=0,
-        most=1e6,
-    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -163,14 +147,14 @@ class FlowTV(Flow):
     tv_weight: float = knob(1.0, "Weight of the flow's total variation; more makes it smoother.", least=0)
 
 
-Encoding = Spline | NoEncoding | NeRF | Fourier | Hash | Siren
-Motion = NoMotion | Translation | Similarity | Affine | Homography | HomographyNetwork | Flow | FlowTV
+Encoding = NoEncoding | NeRF | Fourier | Hash | Siren
+# Behind a bundle model every frame has a transform of its own; as published, a network of time gives them all.
+FrameMotion = NoMotion | Translation | Similarity | Affine | Homography
+PublishedMotion = NoMotion | HomographyNetwork | Flow | FlowTV
+Motion = FrameMotion | Flow | FlowTV | HomographyNetwork
 
 ENCODINGS: Mapping[str, type[Encoding]] = {choice.name: choice for choice in get_args(Encoding)}
-# Behind a bundle model every frame has a transform of its own; as published, a network of time gives them all.
 MOTIONS: Mapping[str, type[Motion]] = {
     choice.name: choice for choice in get_args(Motion) if choice is not HomographyNetwork
 }
-PUBLISHED_MOTIONS: Mapping[str, type[Motion]] = {
-    choice.name: choice for choice in (NoMotion, HomographyNetwork, Flow, FlowTV)
-}
+PUBLISHED_MOTIONS: Mapping[str, type[Motion]] = {choice.name: choice for choice in get_args(PublishedMotion)}

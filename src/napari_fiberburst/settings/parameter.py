@@ -77,6 +77,17 @@ class Knob:
             and (self.most is None or number <= self.most)
         )
 
+    def check(self, value: object) -> None:
+        """Refuse a value that is not allowed.
+
+        Raises
+        ------
+        SettingsError
+            Names the setting, what it may be and what came.
+        """
+        if not self.allows(value):
+            raise SettingsError(f"{self.name} must be {self.expected}; got {value!r}")
+
 
 def knob(
     default: Any,
@@ -123,8 +134,7 @@ def check(settings: object) -> None:
     """
     for name, knob in knobs_of(type(settings)).items():
         value = getattr(settings, name)
-        if not knob.allows(value):
-            raise SettingsError(f"{name} must be {knob.expected}; got {value!r}")
+        knob.check(value)
         if value is not None:
             object.__setattr__(settings, name, knob.kind(value))  # of a frozen dataclass, while it is made
 

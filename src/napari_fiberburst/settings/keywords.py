@@ -1,0 +1,42 @@
+"""The keywords that `reconstruct`, the command line and forms take: every knob there is, on one level."""
+
+from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, HomographyNetwork
+from napari_fiberburst.settings.methods import METHODS, NetworkMethod, PublishedMethod, SplineMethod
+from napari_fiberburst.settings.parameter import Knob, knobs_of
+
+# What the keyword `encoding` takes by name: the spline is chosen in the networks' place.
+ENCODING_NAMES = (SplineMethod.name, *ENCODINGS)
+# The keyword `observation` tells a method's `samples`, or that there is no bundle model to take them with.
+OBSERVATION = Knob(
+    name="observation",
+    kind=str,
+    default="auto",
+    doc="What is taken as one sensor behind the self-calibrated bundle: each core, each lit pixel, or, auto, what the "
+    "burst itself shows; frames stands for the published method, which has no bundle model.",
+    choices=("auto", "cores", "pixels", "frames"),
+)
+# Knobs that some methods have are told by what the user has chosen to come to those methods.
+_METHODS_IN_WORDS = {
+    (SplineMethod,): ("encoding", SplineMethod.name),
+    (NetworkMethod, PublishedMethod): ("", "networks"),
+    (SplineMethod, NetworkMethod): ("", "a bundle model"),
+}
+
+
+def keywords_of(owner: type) -> dict[str, Knob]:
+    """Return the knobs of a method, motion, encoding or of the settings by their keywords."""
+    knobs = {name: knob for name, knob in knobs_of(owner).items() if name != "samples"}
+    return {"observation": OBSERVATION, **knobs} if owner in METHODS.values() else knobs
+
+
+def owners_of(name: str) -> list[tuple[str, str]]:
+    """Return (part, choice) for each choice that the keyword applies to; none where it applies whatever is chosen.
+
+    The part is "motion" or "encoding", or "" where the choice is a group of them.
+    """
+    choices: list[tuple[str, str, type]] = [("motion", known, motion) for known, motion in MOTIONS.items()]
+    choices += [("motion", "homography as published", HomographyNetwork)]
+    choices += [("encoding", known, encoding) for known, encoding in ENCODINGS.items()]
+    owners = [(part, known) for part, known, owner in choices if name in keywords_of(owner)]
+    methods = tuple(method for method in METHODS.values() if name in keywords_of(method))
+    return [*owners, *([_METHODS_IN_WORDS[methods]] if methods in _METHODS_IN_WORDS else [])]
