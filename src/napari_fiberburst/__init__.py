@@ -19,11 +19,14 @@ if TYPE_CHECKING:
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
     from napari_fiberburst.io import read_burst as read_burst
     from napari_fiberburst.motion.registration import Registration as Registration
+    from napari_fiberburst.motion.registration import refine as refine
     from napari_fiberburst.motion.registration import register as register
     from napari_fiberburst.networks.image import load as load
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
+    from napari_fiberburst.pipeline.stages import remeasure as remeasure
+    from napari_fiberburst.pipeline.stages import render as render
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
     from napari_fiberburst.results.progress import Progress as Progress
     from napari_fiberburst.results.reconstruction import Reconstruction as Reconstruction
@@ -51,7 +54,10 @@ _HOMES = {
     "load": "networks.image",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
+    "refine": "motion.registration",
     "register": "motion.registration",
+    "remeasure": "pipeline.stages",
+    "render": "pipeline.stages",
     "sample": "bundle.samples",
     "solve": "scene.solve",
 }

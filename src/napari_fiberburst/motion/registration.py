@@ -146,6 +146,17 @@ class Registration(Stored):
         points: Tensor = transform_points(torch.from_numpy(self.reference_from_frame).to(positions), positions)
         return points
 
+    def correct(self, samples: Samples) -> Samples:
+        """Return samples with the gains that were found taken out, and weighed by how far each frame is to be trusted.
+
+        Parameters
+        ----------
+        samples : Samples
+            Of the frames that were registered, by the bundle as it was before.
+        """
+        gains = torch.from_numpy(self.gains).to(samples.values)
+        return samples.without_gains(gains).weighted(torch.from_numpy(self.frame_weights))
+
     def predicted(self, number: int, pixels: Tensor) -> Tensor:
         """Return the grey light of the scene at pixels (N, 2) of frame `number`, full scale 1; 0 where unknown."""
         if self.scene is None or not self.used[number]:
@@ -176,6 +187,30 @@ def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, s
         Frames that do not belong are marked in `used`, and named in `notes`.
     """
     return drain(registering(samples, dof=dof, iterations=iterations, seed=seed))
+
+
+def refine(
+    samples: Samples, registration: Registration, *, dof: int = 8, iterations: int | None = None, seed: int = 0
+) -> Registration:
+    """Refine a registration to some hundredths of a pixel, with the footprint of the samples in the model.
+
+    Parameters
+    ----------
+    samples : Samples
+        Of cores or of pixels, by a bundle that was measured again after the frames were registered.
+    registration : Registration
+        By `register`. One whose object does not move is returned as it is.
+    dof, seed
+        As for `register`.
+    iterations : int, optional
+        Gauss-Newton iterations at most, those of `registration` included.
+
+    Returns
+    -------
+    Registration
+        With the gains relative to what the samples assume.
+    """
+    return drain(refining(samples, registration, dof=dof, iterations=iterations, seed=seed))
 
 
 def unregistered(samples: Samples) -> Registration:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.bundle.transmission import with_gains
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.motion.registration import Registration
@@ -31,7 +32,7 @@ def diagnose(
     bundle: Bundle,
     registration: Registration,
     scene: Scene,
-    canvas: Canvas,
+    canvas: Canvas | None = None,
     *,
     notes: tuple[str, ...] = (),
     is_scene_shown: bool = True,
@@ -48,8 +49,8 @@ def diagnose(
         Where they lie.
     scene : Scene
         That they were solved for.
-    canvas : Canvas
-        Of the picture.
+    canvas : Canvas, optional
+        Of the image; by default the field of the reference frame, pixel for pixel.
     notes : tuple of str
         What is known to be wrong already.
     is_scene_shown : bool
@@ -58,6 +59,7 @@ def diagnose(
     """
     samples = scene.samples
     points = registration.points(samples.positions)
+    canvas = Canvas.over((0, 0, samples.shape[1], samples.shape[0])) if canvas is None else canvas
     span = acquisition.white_level - acquisition.black_level
     ratios, weights = measured_gains(samples, points, scene.grid, scene.filtered)
     found = Diagnostics(
@@ -130,6 +132,7 @@ def _as_seen(bundle: Bundle, registration: Registration, scene: Scene, weights: 
     Where the gains were not known before, and the object moves, this burst has measured them.
     """
     samples, gains = scene.samples, scene.gains
+    bundle = with_gains(bundle, torch.from_numpy(registration.gains))
     transmission, channels = bundle.transmission, bundle.gains
     if gains.shares is not None:
         x, y = samples.positions.cpu().numpy().astype(np.intp).T

@@ -95,7 +95,8 @@ class NetworkFit:
         """Set up the networks where the alignment has come to."""
         fitted = self._aligned.round_off()
         assert fitted.samples is not None
-        behind = BehindBundle(fitted.samples, fitted.registration.reference_from_frame, self._method.held_out)
+        samples = fitted.registration.correct(fitted.samples)
+        behind = BehindBundle(samples, fitted.registration.reference_from_frame, self._method.held_out)
         method = replace(self._method, samples=fitted.samples.kind)
         problem = Problem(
             self._burst, method, self._device, seed=self._requested.seed, initial=self._initial, behind=behind

@@ -138,5 +138,5 @@ class SplineFit:
         if fitted.scene is not None and (is_last or not fitted.scene.is_draft):
             method = replace(method, smoothness=fitted.scene.smoothness)
         if is_last:
-            method = replace(method, iterations=fitted.registration.rounds or method.iterations or 1)
+            method = replace(method, iterations=fitted.registration.iterations or method.iterations or 1)
         return replace(self._requested, method=method, device=str(self._device))

@@ -10,19 +10,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
+from napari_fiberburst.bundle import transmission
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
-from napari_fiberburst.bundle.transmission import remeasure, with_gains
-from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.motion.registration import Registration, refining, registering, unregistered
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.scene.image import SplineImage
-from napari_fiberburst.scene.solve import Scene, solve_quickly, solving
+from napari_fiberburst.scene.solve import Scene, grid_over, solve_quickly, solving
 from napari_fiberburst.settings import SplineMethod
 
 logger = logging.getLogger(__name__)
@@ -42,13 +46,13 @@ class Fitted:
     Attributes
     ----------
     bundle : Bundle
-        With the gains that have been found so far.
+        That samples are taken with; what gains are found beyond it is in the registration.
     registration : Registration
         Of the frames.
     canvas : Canvas
         Where the picture lies.
     samples : Samples or None
-        The final samples, in all channels, gains taken out; None until it is known what a sample is.
+        The final samples, in all channels, as they were taken; None until it is known what a sample is.
     scene : Scene or None
         The latest solution.
     image : SplineImage or None
@@ -206,22 +210,10 @@ class Stages:
 
     def _refine(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
-        registration = fitted.registration
-        bundle = fitted.bundle
-        if not registration.is_still and not bundle.gains_known:
-            used = np.flatnonzero(registration.used)
-            bundle = remeasure(
-                bundle,
-                self._grey[torch.from_numpy(registration.used)],
-                self._burst,
-                lambda number, pixels: registration.predicted(int(used[number]), pixels),
-            )
+        bundle, registration = remeasured(fitted.bundle, fitted.registration, self._grey, self._burst)
         observe = sample_pixels if self._kind(bundle, registration) == "pixels" else sample_cores
-        sampled = observe(self._frames, bundle, self._burst)
-        samples = sampled.weighted(torch.from_numpy(registration.used))
-        fitted = replace(fitted, bundle=bundle, samples=samples)
-        if registration.is_still:
-            return fitted
+        samples = observe(self._frames, bundle, self._burst)
+        fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples)
         steps = refining(
             samples,
             registration,
@@ -234,16 +226,7 @@ class Stages:
                 fitted = replace(fitted, registration=next(steps))
                 yield fitted
             except StopIteration as end:
-                found: Registration = end.value
-                break
-        gains = torch.from_numpy(found.gains).to(sampled.values)
-        weights = torch.from_numpy(found.frame_weights)
-        return replace(
-            fitted,
-            registration=found,
-            bundle=with_gains(bundle, gains),
-            samples=sampled.without_gains(gains).weighted(weights),
-        )
+                return replace(fitted, registration=end.value)
 
     def _kind(self, bundle: Bundle, registration: Registration) -> str:
         """Return whether cores or pixels are the samples: as asked for, or as the burst itself shows."""
@@ -257,12 +240,8 @@ class Stages:
         return "pixels" if shows_detail(self._grey, bundle, self._burst, cores, registration.predicted) else "cores"
 
     def _in_colour(self, fitted: Fitted) -> Samples:
-        """Return the final samples; before they are known, those of whole cores, with what is known of them."""
-        if fitted.samples is not None:
-            return fitted.samples
-        samples = sample_cores(self._frames, fitted.bundle, self._burst)
-        gains = torch.from_numpy(fitted.registration.gains).to(samples.values)
-        return samples.weighted(torch.from_numpy(fitted.registration.used)).without_gains(gains)
+        """Return the final samples; before they are known, those of whole cores."""
+        return sample_cores(self._frames, fitted.bundle, self._burst) if fitted.samples is None else fitted.samples
 
     def _sketched(self, fitted: Fitted) -> Fitted:
         """Solve a coarse picture of all that is known so far."""
@@ -276,20 +255,8 @@ class Stages:
         """Return what is known with another scene, and the picture that it stands for."""
         if fitted.scene is not None and scene.coefficients is fitted.scene.coefficients:
             return replace(fitted, scene=scene)
-        image = SplineImage(
-            scene=scene.image,
-            grid=scene.grid,
-            known=scene.equations.density() > _LEAST_DENSITY,
-            reach=fitted.bundle.pitch,
-            fill=self._method.fill,
-            homographies=fitted.registration.reference_from_frame,
-            black=self._black(fitted.bundle),
-        )
+        image = image_of(scene, fitted.registration, fitted.bundle, self._burst, fill=self._method.fill)
         return replace(fitted, scene=scene, image=image)
-
-    def _black(self, bundle: Bundle) -> float:
-        levels = self._burst
-        return (bundle.black - levels.black_level) / (levels.white_level - levels.black_level)
 
     def _frame_canvas(self) -> Canvas:
         return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]), self._method.upsample)
@@ -298,7 +265,7 @@ class Stages:
         """Lay the canvas over the reference frame, or over all that any frame saw."""
         if self._method.canvas == "frame":
             return self._frame_canvas()
-        points = registration.points(samples.positions)[samples.weights > 0]
+        points = registration.points(samples.positions)[registration.correct(samples).weights > 0]
         points = points[torch.isfinite(points).all(dim=1)]
         low, high = points.amin(dim=0).floor().tolist(), points.amax(dim=0).ceil().tolist()
         most = _MOST_FIELDS * max(self._burst.shape[1:3])
@@ -310,8 +277,100 @@ class Stages:
         canvas = fitted.canvas
         first = canvas.frame0_from_image[:2, 2]
         last = first + canvas.frame0_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
-        margin = spacing * np.ceil((fitted.bundle.pitch + fitted.bundle.radius) / spacing)
-        return Grid.over((*(first - margin).tolist(), *(last + margin).tolist()), spacing)
+        return grid_over((*first.tolist(), *last.tolist()), spacing, fitted.bundle.pitch + fitted.bundle.radius)
+
+
+def remeasured(
+    bundle: Bundle, registration: Registration, grey: Tensor, acquisition: Acquisition
+) -> tuple[Bundle, Registration]:
+    """Return the bundle measured anew by grey frames (T, H, W) in [0, 1], and the registration without its gains.
+
+    The gains that were found on the way are in the transmission then. Where the object does not move, or the gains were
+    known, both are returned as they are.
+    """
+    if registration.is_still or bundle.gains_known:
+        return bundle, registration
+    used = np.flatnonzero(registration.used)
+    found = transmission.remeasure(
+        bundle,
+        grey[torch.from_numpy(registration.used)],
+        acquisition,
+        lambda number, pixels: registration.predicted(int(used[number]), pixels),
+    )
+    return found, replace(registration, gains=np.ones_like(registration.gains))
+
+
+def remeasure(
+    burst: Burst, bundle: Bundle, registration: Registration, *, device: str = "auto"
+) -> tuple[Bundle, Registration]:
+    """Measure the transmission of a bundle anew, once the frames are registered and the object is known.
+
+    Parameters
+    ----------
+    burst : Burst
+        That the bundle was calibrated from.
+    bundle : Bundle
+        By `calibrate`. One whose gains are known already is returned as it is.
+    registration : Registration
+        By `register`.
+    device : str
+        Where to compute.
+
+    Returns
+    -------
+    Bundle, Registration
+        The bundle, and the registration without the gains that are in the bundle now.
+    """
+    grey = torch.from_numpy(burst.frames).to(find_device(device)).mean(dim=3)
+    return remeasured(bundle, registration, grey, burst)
+
+
+def image_of(
+    scene: Scene, registration: Registration, bundle: Bundle, acquisition: Acquisition, *, fill: bool
+) -> SplineImage:
+    """Return what can be drawn of a scene."""
+    return SplineImage(
+        scene=scene.image,
+        grid=scene.grid,
+        known=scene.equations.density() > _LEAST_DENSITY,
+        reach=bundle.pitch,
+        fill=fill,
+        homographies=registration.reference_from_frame,
+        black=(bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level),
+    )
+
+
+def render(
+    acquisition: Acquisition,
+    bundle: Bundle,
+    registration: Registration,
+    scene: Scene,
+    canvas: Canvas | None = None,
+    *,
+    fill: bool = False,
+) -> NDArray[np.float32]:
+    """Draw a scene in the intensity units of its burst.
+
+    Parameters
+    ----------
+    acquisition : Acquisition
+        Of the burst, or the burst itself.
+    bundle, registration, scene
+        That its samples were taken with, where they lie, and what they were solved for.
+    canvas : Canvas, optional
+        Of the image; by default the field of the reference frame, pixel for pixel.
+    fill : bool
+        Fill in the image where no core has looked, instead of leaving it empty (NaN).
+
+    Returns
+    -------
+    numpy.ndarray
+        (H, W) or (H, W, C) float32.
+    """
+    height, width = bundle.shape
+    canvas = Canvas.over((0, 0, width, height)) if canvas is None else canvas
+    image = image_of(scene, registration, bundle, acquisition, fill=fill)
+    return draw(image, canvas, registration.reference, acquisition)
 
 
 def _warned(text: str) -> str:

@@ -1,7 +1,9 @@
 """Step 4: solve the scene for samples whose places are known, at a smoothness that sets itself."""
 
+import math
 from collections.abc import Generator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
 from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.steps import drain
+from napari_fiberburst.stored import Stored
 
 # Iterations of conjugate gradients for a scene on the way, from an even one.
 _DRAFT_ITERATIONS = 25
@@ -22,7 +25,7 @@ PREVIEW_ITERATIONS = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class Scene(Stored):
     """The scene as a linear spline, and what it was solved from.
 
     Attributes
@@ -44,6 +47,8 @@ class Scene:
     held_out_rmse : float or None
         Root mean square error, full scale 1, of samples left out of the fit, before they were taken in.
     """
+
+    _kind: ClassVar[str] = "scene"
 
     coefficients: Tensor
     smoothness: float
@@ -73,7 +78,7 @@ class Scene:
 def solve(
     samples: Samples,
     registration: Registration,
-    grid: Grid,
+    grid: Grid | None = None,
     *,
     smoothness: float | None = None,
     held_out: float = 0.05,
@@ -84,11 +89,11 @@ def solve(
     Parameters
     ----------
     samples : Samples
-        In all channels, gains taken out.
+        In all channels, as they were taken.
     registration : Registration
-        Where they lie.
-    grid : Grid
-        Nodes of the scene, in pixels of the reference frame.
+        Where they lie, and what gains to take out of them.
+    grid : Grid, optional
+        Nodes of the scene, in pixels of the reference frame; by default one for each of its pixels, and a margin.
     smoothness : float, optional
         Weight of the prior; more is smoother. By default it is chosen by what one part of the samples tells of another.
     held_out : float
@@ -101,12 +106,24 @@ def solve(
     Scene
         Solved from all samples.
     """
+    if grid is None:
+        height, width = samples.shape
+        grid = grid_over((0, 0, width - 1, height - 1), 1.0, samples.pitch + (samples.radius or 0.0))
     return drain(solving(samples, registration, grid, smoothness=smoothness, held_out=held_out, seed=seed))
+
+
+def grid_over(bounds: tuple[float, float, float, float], spacing: float, reach: float) -> Grid:
+    """Return a grid over x0, y0, x1, y1 and `reach` pixels about it; a node lies on (x0, y0)."""
+    margin = spacing * math.ceil(reach / spacing)
+    x0, y0, x1, y1 = bounds
+    return Grid.over((x0 - margin, y0 - margin, x1 + margin, y1 + margin), spacing)
 
 
 def solve_quickly(samples: Samples, registration: Registration, grid: Grid, smoothness: float | None) -> Scene:
     """Return a first scene, for a preview."""
-    return _draft(samples, registration.points(samples.positions), grid, smoothness, PREVIEW_ITERATIONS)
+    return _draft(
+        registration.correct(samples), registration.points(samples.positions), grid, smoothness, PREVIEW_ITERATIONS
+    )
 
 
 def solving(
@@ -119,6 +136,7 @@ def solving(
     seed: int,
 ) -> Generator[Scene, None, Scene]:
     """Solve as `solve` does; yields a draft, twice, and the scene before held-out samples are taken in."""
+    samples = registration.correct(samples)
     points = registration.points(samples.positions)
     scene = _draft(samples, points, grid, smoothness, _DRAFT_ITERATIONS)
     if not registration.is_still:
