@@ -61,7 +61,8 @@ screenshots: .venv/dev
 docs: .venv/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# What the site shows of the examples, and of the latest `make bench`.
+# What the site shows of the examples, and of the latest `make bench`. Rows that were not measured anew stay; only some
+# tables: make docs-results MORE="--tables 1 2"
 docs-pictures: .venv/bench
 	mkdir -p docs/gallery
 	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence where_it_fails; do \
@@ -69,7 +70,7 @@ docs-pictures: .venv/bench
 	cd docs/gallery && rm -f cat.ome.tif cat.json
 
 docs-results: .venv/bench
-	$(BIN)/python -m benchmarks.publish docs/results
+	$(BIN)/python -m benchmarks.publish docs/results $(MORE)
 
 clean:
 	rm -rf .venv .venv-peers demo site .coverage .mypy_cache .pytest_cache .ruff_cache

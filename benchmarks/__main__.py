@@ -15,7 +15,7 @@ from benchmarks.compare import SLOW, compare
 from benchmarks.costs import measure_costs
 from benchmarks.methods import Effort
 from benchmarks.real import RealBurst, measure_real
-from benchmarks.results import TABLES, Results
+from benchmarks.results import TABLES, Recorder
 from napari_fiberburst.errors import FiberBurstError
 
 NUMBERED = dict(enumerate(TABLES, start=1))
@@ -30,47 +30,47 @@ def main() -> int:
         chosen = methods.find(options.methods)
         scenes = cases.find(options.scenes, cases.comparison(is_quick=options.quick, is_large=options.large))
         real = None if options.burst is None else RealBurst.read(options.burst, options.device)
-        results = Results(options.results, mode, resume=options.resume, overwrite=options.overwrite)
-        try:
-            run(results, options, chosen, scenes, real)
-        finally:  # what there is stands in the tables, however the run ends
-            report.write(results)
+        with Recorder(options.results, mode, resume=options.resume, overwrite=options.overwrite) as recorder:
+            try:
+                run(recorder, options, chosen, scenes, real)
+            finally:  # the tables have all rows that there are, however the run ends
+                report.write(recorder.results)
     except FiberBurstError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"wrote {options.results}: tables.md, figures, and rows, a file each")
+    print(f"wrote {options.results}: tables.md, figures, and rows, a file a table")
     return 0
 
 
 def run(
-    results: Results,
+    recorder: Recorder,
     options: argparse.Namespace,
     chosen: tuple[str, ...],
     scenes: tuple[cases.Case, ...],
     real: RealBurst | None,
 ) -> None:
-    """Measure the tables that were asked for, and what of them is not there yet."""
+    """Measure the rows of the chosen tables that are not there yet."""
     iterations = options.paper_iterations or (30 if options.quick else 3000)
     effort = Effort(paper_iterations=iterations, inpainting_steps=30 if options.quick else 600, device=options.device)
     for number in options.tables:
         print(f"Table {NUMBERED[number]}", flush=True)
         if number == 1:
-            compare(results, NUMBERED[1], scenes, chosen, effort, pictures=True)
+            compare(recorder, NUMBERED[1], scenes, chosen, effort, pictures=True)
         elif number == 2:
             case = cases.ablation(is_quick=options.quick)
             steps = options.ablation_iterations or (20 if options.quick else 1000)
-            ablate(results, case, iterations=steps, device=options.device, is_quick=options.quick)
+            ablate(recorder, case, iterations=steps, device=options.device, is_quick=options.quick)
         elif number == 3:
             fast = [name for name in chosen if name not in SLOW]
             bursts = cases.conditions(is_quick=options.quick)
-            compare(results, NUMBERED[3], bursts, fast, effort, pictures=False)
+            compare(recorder, NUMBERED[3], bursts, fast, effort, pictures=False)
         elif number == 4 and real is None:
             print("  skipped: --burst FOLDER names the real burst")
         elif number == 4:
             assert real is not None
-            measure_real(results, real, chosen)
+            measure_real(recorder, real, chosen)
         else:
-            measure_costs(results, device=options.device, is_quick=options.quick)
+            measure_costs(recorder, device=options.device, is_quick=options.quick)
 
 
 def parse() -> argparse.Namespace:
@@ -89,10 +89,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder, default benchmarks/results")
     known = parser.add_mutually_exclusive_group()
     known.add_argument("--resume", action="store_true", help="keep the rows that are there, measure the others")
-    known.add_argument("--overwrite", action="store_true", help="take the rows that are there away first")
+    known.add_argument("--overwrite", action="store_true", help="delete the rows that are there first")
     return parser.parse_args()
 
 
 if __name__ == "__main__":
-    logging.disable(logging.WARNING)  # what a fit says of its burst stands in its row
+    logging.disable(logging.WARNING)  # the notes of a fit are in its row
     sys.exit(main())

@@ -18,7 +18,7 @@ from napari_fiberburst import Burst
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.simulation import Camera, Scene, SimulatedBurst, brownian_motion, simulate
 
-# The published method's encoding, 5 cycles per half frame, was made for a bundle of some 188 cores across.
+# The published encoding's spread, cycles per half frame, and the cores across the bundle that it was chosen for.
 PUBLISHED_SIGMA, PUBLISHED_CORES_ACROSS = 5.0, 188.0
 
 
@@ -186,6 +186,34 @@ def conditions(*, is_quick: bool = False) -> tuple[Case, ...]:
     ]
     cases = [Case(name=name, **{**base, **change}) for name, change in changed]
     return tuple(case for case in cases if case.name in ("as it is", "2 frames")) if is_quick else tuple(cases)
+
+
+def costs(*, is_quick: bool = False) -> tuple[Case, ...]:
+    """Return the fifth table's bursts: frames, side and channels grow one by one, and the side in both physics."""
+    if is_quick:
+        sizes = [("core", 5, 96, 3), ("core", 10, 96, 3), ("mask", 5, 96, 3), ("mask", 10, 96, 3)]
+    else:
+        sides = [("core", 20, side, 3) for side in (256, 300, 424, 600)]
+        frames = [("core", frames, 256, 3) for frames in (5, 10, 40)]
+        channels = [("core", 20, 256, channels) for channels in (1, 8)]
+        masks = [("mask", 20, side, 3) for side in (256, 300, 424, 600)]
+        sizes = [*frames, *sides, *channels, *masks]
+    return tuple(
+        Case(
+            name=f"{frames} x {side} x {side} x {channels}, {physics}",
+            side=side,
+            frames=frames,
+            channels=channels,
+            physics=physics,
+        )
+        for physics, frames, side, channels in sizes
+    )
+
+
+def largest_cost(*, is_quick: bool = False) -> Case:
+    """Return the burst on which the fifth table times the stages of the default and the published method."""
+    side = 96 if is_quick else 600
+    return Case(name=f"20 x {side} x {side} x 3, core", side=side)
 
 
 def find(names: list[str] | None, cases: tuple[Case, ...]) -> tuple[Case, ...]:

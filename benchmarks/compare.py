@@ -1,9 +1,9 @@
 """Tables 1 and 3: every method on every burst, scored against the truth in two ways.
 
 PSNR and SSIM are of frame 0, every pixel. "Matched" is after the one gain and offset per channel that bring the
-picture closest to the truth: a bundle passes only part of the light, and how large a part no burst can tell, so that
-only what is left then tells of quality. "As given" is without: it is what the paper prints of a captured frame, and
-mostly tells how dark a method leaves its picture.
+picture closest to the truth: a bundle passes only part of the light, no burst can tell how large a part, and so the
+quality of a method shows in the error that remains. "As given" is without: the paper prints it of a captured frame, and
+it depends mostly on how dark a method leaves its picture.
 """
 
 from collections.abc import Sequence
@@ -15,25 +15,26 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmarks.cases import Case
 from benchmarks.methods import METHODS, Effort, Outcome, PeerError
-from benchmarks.results import Results, Row
+from benchmarks.results import Recorder
+from benchmarks.rows import Row
 from napari_fiberburst.quality import match_levels, motion_error, psnr, ssim
 from napari_fiberburst.simulation import SimulatedBurst
 
-# What the third table leaves out: two methods whose work on 24 bursts would take hours.
+# The third table leaves out two methods, because they would take hours on its 24 bursts.
 SLOW = ("inpainting", "paper")
 
 
 def compare(
-    results: Results, table: str, cases: Sequence[Case], methods: Sequence[str], effort: Effort, *, pictures: bool
+    recorder: Recorder, table: str, cases: Sequence[Case], methods: Sequence[str], effort: Effort, *, pictures: bool
 ) -> None:
     """Fill the rows of a table; `pictures` keeps what each method draws, and the truth."""
     for case in cases:
         print(case, flush=True)
         if pictures:
-            results.row(table, case.name, "truth", lambda case=case: {"picture": case.make().truth[0]})  # type: ignore[misc]
+            recorder.row(table, case.name, "truth", lambda case=case: {"picture": case.make().truth[0]})  # type: ignore[misc]
         for name in methods:
-            given = {"burst": asdict(case), **{part: getattr(effort, part) for part in METHODS[name].heeds}}
-            row = results.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures), given)  # noqa: B023
+            recipe = {"burst": asdict(case), **{part: getattr(effort, part) for part in METHODS[name].depends_on}}
+            row = recorder.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures), recipe)  # noqa: B023
             print(f"  {METHODS[name].label:34} {in_words(row)}", flush=True)
 
 

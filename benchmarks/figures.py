@@ -1,5 +1,8 @@
 """Figures, by matplotlib, from the rows and pictures of a results folder."""
 
+from collections.abc import Iterator
+from io import BytesIO
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
@@ -9,7 +12,7 @@ from benchmarks.methods import METHODS
 from benchmarks.results import ABLATION, CONDITIONS, REAL, SCENES, Results
 
 DOTS_PER_INCH = 110
-# One colour a method in all figures (Okabe and Ito, 2008: told apart by all eyes).
+# One colour a method in all figures, after Okabe and Ito (2008), whose colours colour-blind readers can distinguish.
 COLOURS = (
     "#999999",
     "#56B4E9",
@@ -25,22 +28,21 @@ COLOURS = (
 )
 
 
-def draw(results: Results) -> None:
-    """Draw all figures whose rows are there."""
+def drawn(results: Results) -> Iterator[tuple[str, Figure]]:
+    """Yield all figures whose rows and pictures are there, by name."""
     mpl.use("Agg")
-    for name, make in (
-        ("scenes", _scenes),
-        ("convergence", _convergence),
-        ("conditions", _conditions),
-        ("real", _real),
-        ("profiles", _profiles),
-    ):
+    for name, make in FIGURES.items():
         figure = make(results)
         if figure is not None:
-            path = results.folder / "figures" / f"{name}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=DOTS_PER_INCH, bbox_inches="tight")
+            yield name, figure
             plt.close(figure)
+
+
+def as_png(figure: Figure) -> bytes:
+    """Return a figure as the content of a file."""
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=DOTS_PER_INCH, bbox_inches="tight")
+    return file.getvalue()
 
 
 def colour(method: str) -> str:
@@ -50,16 +52,17 @@ def colour(method: str) -> str:
 
 def _scenes(results: Results) -> Figure | None:
     rows = {(row["case"], row["method"]): row for row in results.rows(SCENES)}
-    cases = sorted({case for case, _ in rows}, key=lambda case: rows.get((case, "truth"), {}).get("date", ""))
+    cases = list(dict.fromkeys(case for case, _ in rows))
     columns = [name for name in ("truth", *METHODS) if any(method == name for _, method in rows)]
-    if not cases:
+    pictures = {key: results.picture(SCENES, *key) for key, row in rows.items() if "missing" not in row}
+    if not cases or any(picture is None for picture in pictures.values()):
         return None
     figure, axes = plt.subplots(
         len(cases), len(columns), figsize=(1.9 * len(columns), 2.2 * len(cases)), squeeze=False, layout="constrained"
     )
     for number, (across, case) in enumerate(zip(axes, cases, strict=True)):
         for axis, method in zip(across, columns, strict=True):
-            picture = results.picture(SCENES, case, method)
+            picture = pictures.get((case, method))
             axis.set_xticks([])
             axis.set_yticks([])
             if picture is not None:
@@ -105,7 +108,7 @@ def _conditions(results: Results) -> Figure | None:
     rows = [row for row in results.rows(CONDITIONS) if "psnr" in row]
     if not rows:
         return None
-    cases = list(dict.fromkeys(row["case"] for row in sorted(rows, key=lambda row: row["date"])))
+    cases = list(dict.fromkeys(row["case"] for row in rows))
     figure, axis = plt.subplots(figsize=(8, 0.28 * len(cases) + 1.2), layout="constrained")
     for method in METHODS:
         own = [row for row in rows if row["method"] == method]
@@ -127,12 +130,11 @@ def _conditions(results: Results) -> Figure | None:
 def _real(results: Results) -> Figure | None:
     found = {row["method"]: row for row in results.rows(REAL) if "elements" in row}
     names = [name for name in METHODS if name in found]
-    if not names:
+    pictures = [picture for name in names if (picture := results.picture(REAL, "chart", name)) is not None]
+    if not names or len(pictures) < len(names):
         return None
     figure, axes = plt.subplots(1, len(names), figsize=(3.1 * len(names), 3.9), squeeze=False, layout="constrained")
-    for axis, name in zip(axes[0], names, strict=True):
-        picture = results.picture(REAL, "chart", name)
-        assert picture is not None
+    for axis, name, picture in zip(axes[0], names, pictures, strict=True):
         axis.imshow(picture[380:860, 90:390], cmap="gray", vmin=0, vmax=255)  # group 7
         axis.set_title(
             f"{METHODS[name].label}\nM {found[name]['modulation']:.2f}, ring {found[name]['ring_db']:.0f} dB",
@@ -157,3 +159,29 @@ def _profiles(results: Results) -> Figure | None:
     axes[0].set_ylabel("light, chart's dark = 0, glass = 1")
     axes[-1].legend(fontsize=7)
     return figure
+
+
+def _published_start(results: Results) -> Figure | None:
+    curves = results.start_curves
+    if not curves:
+        return None
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for name, curve in sorted(curves.items()):
+        steps, decibels, similarity, _ = np.array(curve).T
+        axes[0].plot(steps, decibels, label=name)
+        axes[1].plot(steps, similarity, label=name)
+    for axis, label in zip(axes, ("PSNR, dB", "SSIM"), strict=True):
+        axis.set(xlabel="steps", ylabel=label)
+        axis.grid(alpha=0.3)
+    axes[1].legend(frameon=False, fontsize=8)
+    return figure
+
+
+FIGURES = {
+    "scenes": _scenes,
+    "convergence": _convergence,
+    "conditions": _conditions,
+    "real": _real,
+    "profiles": _profiles,
+    "published_start": _published_start,
+}

@@ -26,8 +26,8 @@ def main() -> None:
         path = Path(folder, "burst.npz")
         np.savez(path, frames=simulate("histology", shape=(600, 600), seed=0).arrays()["frames"])
         command = [sys.executable, __file__, str(path)]
-        told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    print(f"20 x 600 x 600 RGB, uint8, published batch of 45000: peak memory {float(told):.0f} MiB; limit 2048 MiB")
+        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    print(f"20 x 600 x 600 RGB, uint8, published batch of 45000: peak memory {float(printed):.0f} MiB; limit 2048 MiB")
 
 
 if __name__ == "__main__":

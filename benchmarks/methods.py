@@ -1,4 +1,4 @@
-"""The methods: each makes one picture of a burst. What each is told beyond the burst stands with it."""
+"""The methods: each makes one picture of a burst, and says what it is given beside the burst."""
 
 import os
 import subprocess
@@ -15,21 +15,17 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from benchmarks.cases import Case
 from benchmarks.peers import inpainting, unet
-from napari_fiberburst import Progress, Reconstruction, reconstruct
-from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.bundle.samples import sample
-from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst import Bundle, Progress, Reconstruction, Registration, reconstruct, render, sample, solve
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError, SettingsError
-from napari_fiberburst.motion.registration import Registration
-from napari_fiberburst.pipeline.stages import Fitted, Stages
+from napari_fiberburst.pipeline.stages import Stages
 from napari_fiberburst.quality import psnr
-from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.settings import SplineMethod
 from napari_fiberburst.simulation import SimulatedBurst
 from napari_fiberburst.steps import drain
 
 Picture = NDArray[np.float32]
+# Standard deviations of the Gaussian filters, pixels: 31 to choose from, and one for all bursts.
 WIDTHS = np.arange(0.5, 8.1, 0.25)
 FIXED_WIDTH = 2.0
 PEER_PYTHON = Path(__file__).parents[1] / ".venv-peers" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
@@ -95,18 +91,18 @@ class Method:
     ----------
     label : str
         As the tables have it.
-    told : str
+    given : str
         What it is given beside the burst.
     run : callable
         (case, simulated burst, effort) to outcome.
-    heeds : tuple of str
+    depends_on : tuple of str
         The parts of the effort that make a difference to it.
     """
 
     label: str
-    told: str
+    given: str
     run: Callable[[Case, SimulatedBurst, Effort], Outcome]
-    heeds: tuple[str, ...] = ()
+    depends_on: tuple[str, ...] = ()
 
 
 def captured(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
@@ -115,7 +111,7 @@ def captured(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
 
 
 def gaussian(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
-    """Return frame 0, filtered by the width that the truth likes best."""
+    """Return frame 0, filtered by the width whose picture is closest to the truth."""
     truth = simulated.truth[0]
     start = time.perf_counter()
     tried = [blurred(simulated.burst.frames[0], width) for width in WIDTHS]
@@ -178,42 +174,41 @@ def default(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
 
 
 def oracle(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
-    """Return what our solver makes of the burst when it is told the true motion and transmission."""
+    """Return what our solver makes of the burst when it is given the true motion and transmission."""
     start = time.perf_counter()
     burst, bundle = simulated.burst, Bundle.from_image(simulated.transmission)
     samples = sample(burst, bundle, "pixels" if case.physics == "mask" else "cores", device=effort.device)
     known = Registration.known(simulated.homographies, samples.cores)
-    canvas = Canvas.over((0, 0, burst.shape[2], burst.shape[1]))
-    told = Fitted(bundle=bundle, registration=known, canvas=canvas, samples=samples)
-    found = drain(Stages(burst, SplineMethod(fill=True), find_device(effort.device), given=bundle).solve(told))
-    assert found.image is not None
+    image = render(burst, bundle, known, solve(samples, known), fill=True)
     return Outcome(
-        picture=_in_full_scale(simulated, draw(found.image, canvas, 0, burst)),
+        picture=_in_full_scale(simulated, image),
         seconds=time.perf_counter() - start,
         homographies=simulated.homographies,
     )
 
 
 METHODS: Mapping[str, Method] = {
-    "captured": Method(label="captured frame", told="", run=captured),
-    "gaussian": Method(label="Gaussian filter, best width", told="the truth, to choose its width", run=gaussian),
-    "gaussian-fixed": Method(label="Gaussian filter, 2 px", told="", run=gaussian_fixed),
-    "mean": Method(label="mean after registration", told="our registration", run=registered_mean, heeds=("device",)),
+    "captured": Method(label="captured frame", given="", run=captured),
+    "gaussian": Method(label="Gaussian filter, best width", given="the truth, to choose its width", run=gaussian),
+    "gaussian-fixed": Method(label="Gaussian filter, 2 px", given="", run=gaussian_fixed),
+    "mean": Method(
+        label="mean after registration", given="our registration", run=registered_mean, depends_on=("device",)
+    ),
     "pyfibrebundle": Method(
-        label="PyFibreBundle, one frame", told="true layout and transmission", run=fibrebundle_single
+        label="PyFibreBundle, one frame", given="true layout and transmission", run=fibrebundle_single
     ),
     "pyfibrebundle-sr": Method(
-        label="PyFibreBundle, super-resolution", told="true layout and transmission", run=fibrebundle_super
+        label="PyFibreBundle, super-resolution", given="true layout and transmission", run=fibrebundle_super
     ),
-    "unet": Method(label="supervised U-Net", told="1200 training pairs", run=supervised),
+    "unet": Method(label="supervised U-Net", given="1200 training pairs", run=supervised),
     "inpainting": Method(
-        label="INR inpainting", told="true layout and transmission", run=inpainted, heeds=("inpainting_steps",)
+        label="INR inpainting", given="true layout and transmission", run=inpainted, depends_on=("inpainting_steps",)
     ),
     "paper": Method(
-        label="published method", told="sigma by the true pitch", run=paper, heeds=("paper_iterations", "device")
+        label="published method", given="sigma by the true pitch", run=paper, depends_on=("paper_iterations", "device")
     ),
-    "default": Method(label="napari-fiberburst", told="", run=default, heeds=("device",)),
-    "oracle": Method(label="oracle", told="true motion and transmission", run=oracle, heeds=("device",)),
+    "default": Method(label="napari-fiberburst", given="", run=default, depends_on=("device",)),
+    "oracle": Method(label="oracle", given="true motion and transmission", run=oracle, depends_on=("device",)),
 }
 
 
@@ -274,8 +269,8 @@ def mean_over(frames: Picture, homographies: NDArray[np.float64]) -> Picture:
     return mean
 
 
-def fibrebundle(method: str, **told: Any) -> tuple[Picture, float]:
-    """Run PyFibreBundle; see `benchmarks/peers/pyfibrebundle.py` for what it is told.
+def fibrebundle(method: str, **inputs: Any) -> tuple[Picture, float]:
+    """Run PyFibreBundle; see `benchmarks/peers/pyfibrebundle.py` for its inputs.
 
     Raises
     ------
@@ -286,7 +281,7 @@ def fibrebundle(method: str, **told: Any) -> tuple[Picture, float]:
         raise PeerError("not installed: make peers")
     with tempfile.TemporaryDirectory() as folder:
         given, made = Path(folder, "given.npz"), Path(folder, "made.npz")
-        np.savez(given, **told)
+        np.savez(given, **inputs)
         ended = subprocess.run([PEER_PYTHON, _WORKER, method, given, made], capture_output=True, text=True)
         if ended.returncode:
             said = ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"]

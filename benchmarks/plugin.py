@@ -18,7 +18,7 @@ from napari_fiberburst.plugin.contributions import make_sample
 from napari_fiberburst.plugin.dock import FiberBurstWidget
 
 ROUNDS = 3
-# A fit of half a minute, as published, tells of the speed in the long run; the default is done in seconds.
+# The published method runs for half a minute, which shows the speed in the long run; the default is done in seconds.
 FITS: dict[str, dict[str, Any]] = {"auto": {}, "paper, 100 steps": {"preset": "paper", "iterations": 100}}
 CYCLES = 100
 MEBIBYTE = 2**20
@@ -86,13 +86,13 @@ def measure_speed() -> None:
         viewer, dock, frames = open_window(is_drawn=os.environ.get("QT_QPA_PLATFORM") != "offscreen")
         dock.form.set_choices(choices)
         for number in range(ROUNDS):
-            told = in_plugin(viewer, dock)
+            found = in_plugin(viewer, dock)
             script = in_script(frames, choices, 0.25)
-            longest = ", ".join(f"{gap:.0f}" for gap in told["gaps"][:3])
-            late = sum(gap > 100 for gap in told["gaps"])
+            longest = ", ".join(f"{gap:.0f}" for gap in found["gaps"][:3])
+            late = sum(gap > 100 for gap in found["gaps"])
             print(
-                f"{name:18} {'cold' if number == 0 else 'warm'}: first picture {told['first']:.1f} s; "
-                f"{told['rate']:.2f} it/s, script {script:.2f}, ratio {told['rate'] / script:.2f}; window away for "
+                f"{name:18} {'cold' if number == 0 else 'warm'}: first picture {found['first']:.1f} s; "
+                f"{found['rate']:.2f} it/s, script {script:.2f}, ratio {found['rate'] / script:.2f}; window away for "
                 f"{longest} ms at most, over 100 ms {late} times"
             )
         viewer.close()

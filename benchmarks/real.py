@@ -18,7 +18,8 @@ from skimage.registration import phase_cross_correlation
 from benchmarks import chart
 from benchmarks.chart import BLACK_LEVEL, Shown, finest
 from benchmarks.methods import FIXED_WIDTH, PeerError, fibrebundle
-from benchmarks.results import REAL, Results, Row
+from benchmarks.results import REAL, Recorder
+from benchmarks.rows import Row
 from napari_fiberburst import Burst, read_burst, reconstruct
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
@@ -97,7 +98,7 @@ METHODS: Mapping[str, Method] = {
 }
 
 
-def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) -> None:
+def measure_real(recorder: Recorder, real: RealBurst, methods: tuple[str, ...]) -> None:
     """Fill the table."""
     honeycomb = captured(real, real.frames)[0].ring()
     for name in methods:
@@ -110,7 +111,7 @@ def measure_real(results: Results, real: RealBurst, methods: tuple[str, ...]) ->
             except PeerError as error:
                 return {"missing": str(error)}
 
-        row = results.row(REAL, "chart", name, compute, {"device": real.device} if name == "default" else {})
+        row = recorder.row(REAL, "chart", name, compute, {"device": real.device} if name == "default" else {})
         line = row.get(
             "missing"
         ) or "M {modulation:.2f}, finest {finest}, ring {ring_db:.1f} dB, nrmse {nrmse:.3f}, {seconds:.1f} s".format(

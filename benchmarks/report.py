@@ -1,4 +1,4 @@
-"""Tables in Markdown and figures in PNG, from the rows of a results folder."""
+"""Tables in Markdown, from the rows of a results folder."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -6,7 +6,8 @@ from statistics import mean
 
 from benchmarks import figures
 from benchmarks.methods import METHODS
-from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, Results, Row
+from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, Results
+from benchmarks.rows import Row
 
 ABSENT = "-"  # not measured
 DECIBELS = (20, 22, 25, 30, 35, 40)
@@ -14,13 +15,21 @@ DECIBELS = (20, 22, 25, 30, 35, 40)
 
 def write(results: Results) -> Path:
     """Write `tables.md` and `figures/` into the results folder, from all rows that are there."""
-    parts = [_about(results)]
-    for build in (_scenes, _ablation, _conditions, _real, _costs):
-        parts += build(results)
-    figures.draw(results)
+    for name, figure in figures.drawn(results):
+        path = results.folder / "figures" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(figures.as_png(figure))
     path = results.folder / "tables.md"
-    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    path.write_text(in_markdown(results), encoding="utf-8")
     return path
+
+
+def in_markdown(results: Results) -> str:
+    """Return all tables whose rows are there, with links to ``figures/NAME.png``."""
+    parts = _about(results)
+    for build in (_scenes, _ablation, _conditions, _real, _costs, _start):
+        parts += build(results)
+    return "\n\n".join(parts) + "\n"
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -29,14 +38,23 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _about(results: Results) -> str:
+def _about(results: Results) -> list[str]:
     about = results.about
+    if not about:
+        return []
+    sentences = [
+        f"Measured on {_machine(about)} ({about['mode']} run).",
+        "The date of each table is UTC; a plus after its commit: with changes not yet committed.",
+    ]
+    for one in about.get("earlier", []):
+        sentences.append(f"Rows before {one['until'][:16]}: {_machine(one)}, {one['torch_threads']} threads.")
+    return [" ".join(sentences)]
+
+
+def _machine(about: Row) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in about["versions"].items() if number)
     machine = f"{about['processor']}, {about['cores']} cores, {about['memory_gib']} GiB, {about['gpu'] or 'no GPU'}"
-    return (
-        f"Measured on {about['system']}, {machine}; Python {about['python']}, {versions} ({about['mode']} run). The "
-        "date of each table is UTC; a plus after its commit: with changes not yet committed."
-    )
+    return f"{about['system']}, {machine}; Python {about['python']}, {versions}"
 
 
 def _measured(rows: Sequence[Row]) -> str:
@@ -60,7 +78,7 @@ def _scenes(results: Results) -> list[str]:
             f"seed {burst['seed']})"
         )
         header = ["", "told", "PSNR dB / SSIM", "as given", "motion off by", "time", "compression"]
-        lines = [[METHODS[name].label, METHODS[name].told, *_scored(own[name])] for name in METHODS if name in own]
+        lines = [[METHODS[name].label, METHODS[name].given, *_scored(own[name])] for name in METHODS if name in own]
         parts.append(table(header, lines))
     return [*parts, "![Table 1 in pictures](figures/scenes.png)"]
 
@@ -79,7 +97,7 @@ def _scored(row: Row) -> list[str]:
 
 
 def _ablation(results: Results) -> list[str]:
-    rows = list(results.rows(ABLATION))
+    rows = results.rows(ABLATION)
     if not rows:
         return []
     found = {(row["motion"], row["encoding"], row["bundle_model"]): row for row in rows}
@@ -109,7 +127,7 @@ def _ablation(results: Results) -> list[str]:
 
 
 def _conditions(results: Results) -> list[str]:
-    rows = list(results.rows(CONDITIONS))
+    rows = results.rows(CONDITIONS)
     if not rows:
         return []
     found = {(row["case"], row["method"]): row for row in rows}
@@ -179,7 +197,7 @@ def _modulations(row: Row, group: int, element: int) -> str:
 
 
 def _costs(results: Results) -> list[str]:
-    rows = list(results.rows(COST))
+    rows = results.rows(COST)
     if not rows:
         return []
     own = sorted((row for row in rows if row["method"] == "default"), key=lambda row: row["seconds"])
@@ -198,9 +216,30 @@ def _costs(results: Results) -> list[str]:
     ]
     for row in rows:
         if row["method"] == "stages":
-            told = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row["stages"].items())
-            parts.append(f"Where the default's time goes ({row['case']}): {told}.")
+            stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row["stages"].items())
+            parts.append(f"Where the default's time goes ({row['case']}): {stages}.")
     return [*parts, *_time_to_quality(results)]
+
+
+def _start(results: Results) -> list[str]:
+    """Return how the published method ends from each start."""
+    curves = results.start_curves
+    if not curves:
+        return []
+    lines = []
+    for name, curve in sorted(curves.items()):
+        best, last = max(curve, key=lambda point: point[1]), curve[-1]
+        reached = [
+            f"{decibels:.1f} / {similarity:.2f} at step {step}" for step, decibels, similarity, _ in (best, last)
+        ]
+        lines.append([name, *reached, f"{last[3]:.2f} px"])
+    return [
+        "### The start of the published method",
+        "PSNR dB / SSIM of frame 0 on the way, on one burst with everything else as published: see "
+        "`benchmarks/published_start.py`.",
+        table(["", "best", "at the end", "motion off by"], lines),
+        "![The start of the published method](figures/published_start.png)",
+    ]
 
 
 def _time_to_quality(results: Results) -> list[str]:
@@ -236,8 +275,8 @@ def seconds_to(row: Row, decibels: float) -> float | None:
 
 
 def _in_order(rows: Sequence[Row], column: str) -> list[str]:
-    """Return a column's values in the order in which they were measured."""
-    return list(dict.fromkeys(row[column] for row in sorted(rows, key=lambda row: str(row["date"]))))
+    """Return a column's values in the order of the rows."""
+    return list(dict.fromkeys(row[column] for row in rows))
 
 
 def _time(seconds: float) -> str:

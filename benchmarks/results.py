@@ -1,15 +1,16 @@
-"""The results folder: a file a row, written when the row is done, so that a killed run goes on where it was."""
+"""The results folder: a file a table, a row written when it is done, so that a killed run goes on where it was."""
 
 import json
-import os
 import platform
 import re
 import subprocess
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import IO, Self
 
 import numpy as np
 import psutil
@@ -17,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.rows import Row, drop_half_line, plain, put_row, read_rows, write_whole
 from napari_fiberburst.errors import OutputError
 
-Row = dict[str, Any]
 SCENES, ABLATION, CONDITIONS, REAL, COST = TABLES = (
     "1 scenes",
     "2 ablation",
@@ -30,8 +31,62 @@ SCENES, ABLATION, CONDITIONS, REAL, COST = TABLES = (
 PACKAGES = ("napari-fiberburst", "numpy", "scipy", "scikit-image", "torch", "matplotlib")
 
 
+# What must be the same for two runs' times to be compared.
+MACHINE = ("python", "system", "processor", "cores", "torch_threads", "memory_gib", "gpu", "versions")
+_START_CURVES = "published_start.json"
+
+# Where a fit stood: (step, PSNR in dB, SSIM, motion error in pixels) at several steps.
+Curve = list[tuple[int, float, float, float]]
+
+
+@dataclass(frozen=True)
 class Results:
-    """Rows of tables in a folder.
+    """A folder of rows and pictures, to read.
+
+    Attributes
+    ----------
+    folder : Path
+        Holds ``rows/``, a JSONL file a table, and ``about.json``.
+    pictures : Path, optional
+        Where the pictures are, a PNG a row; default ``pictures/`` in the folder.
+    """
+
+    folder: Path
+    pictures: Path | None = None
+
+    def rows(self, table: str) -> list[Row]:
+        """Return all rows of a table that are there, in the order in which they were measured first."""
+        return list(read_rows(self.rows_file(table)).values())
+
+    def rows_file(self, table: str) -> Path:
+        """Return where a table's rows are."""
+        return self.folder / "rows" / f"{slug(table)}.jsonl"
+
+    def picture(self, table: str, case: str, method: str) -> NDArray[np.uint8] | None:
+        """Return a row's picture; None where there is none."""
+        path = self.picture_file(table, case, method)
+        return np.asarray(Image.open(path)) if path.exists() else None
+
+    def picture_file(self, table: str, case: str, method: str) -> Path:
+        """Return where a row's picture is."""
+        return (self.pictures or self.folder / "pictures") / slug(table) / f"{slug(case)}.{slug(method)}.png"
+
+    @property
+    def about(self) -> Row:
+        """What kind of run it was, and its machine, versions and commit; empty where nothing has been measured.
+
+        `earlier` in it are the same of runs on other machines or versions, and `until` when they had ended.
+        """
+        return _read_json(self.folder / "about.json")
+
+    @property
+    def start_curves(self) -> dict[str, Curve]:
+        """Fits of the published method from several starts, by name; see `benchmarks.published_start`."""
+        return _read_json(self.folder / _START_CURVES)
+
+
+class Recorder:
+    """The one run that writes into a results folder; a context that leaves the folder to others when it ends.
 
     Parameters
     ----------
@@ -40,38 +95,53 @@ class Results:
     mode : str
         What kind of run it is ("full", "quick", "large"): rows of two kinds do not mix.
     resume : bool
-        Keep the rows that are there, and make only those that are not.
+        Keep the rows that are there, and measure only the others.
     overwrite : bool
-        Take away the rows that are there.
+        Delete the rows that are there.
 
     Raises
     ------
     OutputError
-        The folder holds results and neither `resume` nor `overwrite` says what to do with them; or they are of
-        another mode.
+        The folder holds results and neither `resume` nor `overwrite` says what to do with them, they are of another
+        mode, or another run is writing into the folder.
     """
 
     def __init__(self, folder: Path, mode: str, *, resume: bool = False, overwrite: bool = False) -> None:
-        self.folder = folder
-        self._mode = mode
-        about = folder / "about.json"
-        if about.exists():
-            before = json.loads(about.read_text(encoding="utf-8"))["mode"]
-            if overwrite:
-                for path in [path for made in ("rows/*/*", "pictures/*/*", "figures/*") for path in folder.glob(made)]:
-                    path.unlink()
-            elif not resume:
-                raise OutputError(f"{folder} holds results; --resume goes on with them, --overwrite begins anew")
-            elif before != mode:
-                raise OutputError(
-                    f"{folder} holds results of a {before} run; this is a {mode} one: name another folder"
-                )
+        self.results = Results(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        machine = describe_machine()
-        self._commit = machine["commit"]  # files may change while a long run goes on; it does not see that
-        write_json(about, {"mode": mode, **machine})
+        self._lock = _locked(folder)
+        try:
+            self._begin(mode, resume=resume, overwrite=overwrite)
+        except BaseException:
+            self._lock.close()
+            raise
 
-    def row(self, table: str, case: str, method: str, compute: Callable[[], Row], given: Row | None = None) -> Row:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._lock.close()
+
+    def _begin(self, mode: str, *, resume: bool, overwrite: bool) -> None:
+        folder, before = self.results.folder, self.results.about
+        if before and overwrite:
+            for path in [path for made in ("rows/*.jsonl", "pictures/*/*", "figures/*") for path in folder.glob(made)]:
+                path.unlink()
+            before = {}
+        elif before and not resume:
+            raise OutputError(f"{folder} holds results; --resume goes on with them, --overwrite begins anew")
+        elif before and before["mode"] != mode:
+            raise OutputError(
+                f"{folder} holds results of a {before['mode']} run; this is a {mode} one: name another folder"
+            )
+        for path in sorted(folder.glob("rows/*.jsonl")):
+            if drop_half_line(path):
+                print(f"dropped the last line of {path}, which was not written to its end", flush=True)
+        about = {"mode": mode, **describe_machine()}
+        self._commit = about["commit"]  # files may change while a long run goes on; it does not see that
+        write_json(folder / "about.json", with_earlier(about, before))
+
+    def row(self, table: str, case: str, method: str, compute: Callable[[], Row], recipe: Row | None = None) -> Row:
         """Return a row: as it was written before from the same recipe, or computed and written now.
 
         Parameters
@@ -79,41 +149,58 @@ class Results:
         table, case, method : str
             Where it stands.
         compute : callable
-            Makes what was found. A picture in it, (H, W) or (H, W, C) with 1 as full scale, is written beside the row
+            Makes what was found. A picture in it, (H, W) or (H, W, C) with 1 as full scale, is written beside the rows
             as PNG.
-        given : dict, optional
-            The recipe, which becomes part of the row: the burst, and how many steps a method may take.
+        recipe : dict, optional
+            Becomes part of the row: the burst, and how many steps a method may take.
         """
-        path = self.folder / "rows" / slug(table) / f"{slug(case)}.{slug(method)}.json"
-        recipe: Row = json.loads(_as_json(given or {}))
-        if path.exists():
-            known: Row = json.loads(path.read_text(encoding="utf-8"))
+        recipe = plain(recipe or {})
+        path = self.results.rows_file(table)
+        known = read_rows(path).get((case, method))
+        if known is not None:
             is_same = all(name in known and known[name] == value for name, value in recipe.items())
             if is_same and "missing" not in known:  # a peer may have been installed since
                 return known
         found = {"table": table, "case": case, "method": method, **recipe, **compute()}
         picture = found.pop("picture", None)
         if picture is not None:
-            drawn = self.folder / "pictures" / slug(table) / f"{slug(case)}.{slug(method)}.png"
-            write_picture(drawn, picture)
-        write_json(path, {**found, "commit": self._commit, "date": now()})
+            write_picture(self.results.picture_file(table, case, method), picture)
+        put_row(path, {**found, "commit": self._commit, "date": now()})
         return found
 
-    def rows(self, table: str) -> Iterator[Row]:
-        """Return all rows of a table that are there."""
-        for path in sorted((self.folder / "rows" / slug(table)).glob("*.json")):
-            yield json.loads(path.read_text(encoding="utf-8"))
 
-    def picture(self, table: str, case: str, method: str) -> NDArray[np.uint8] | None:
-        """Return a row's picture."""
-        path = self.folder / "pictures" / slug(table) / f"{slug(case)}.{slug(method)}.png"
-        return np.asarray(Image.open(path)) if path.exists() else None
+def with_earlier(about: Row, before: Row) -> Row:
+    """Return what is known of a run, with what is known of runs before it that had another machine or versions."""
+    earlier = [*before.get("earlier", []), *about.get("earlier", [])]
+    if before and not _is_same_machine(before, about):
+        latest = {name: value for name, value in before.items() if name != "earlier"}
+        earlier.append({**latest, "until": about["date"]})
+    differing = [one for one in earlier if not _is_same_machine(one, about)]
+    return {**about, "earlier": differing} if differing else about
 
-    @property
-    def about(self) -> Row:
-        """What machine, versions and commit the latest run had."""
-        told: Row = json.loads((self.folder / "about.json").read_text(encoding="utf-8"))
-        return told
+
+def _is_same_machine(one: Row, other: Row) -> bool:
+    return all(one[name] == other[name] for name in MACHINE)
+
+
+def _locked(folder: Path) -> IO[bytes]:
+    """Return a file that is this run's alone until it is closed, which the system does for a run that is killed."""
+    file = (folder / "writer.lock").open("ab")
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError) as error:
+        file.close()
+        raise OutputError(
+            f"another run is writing into {folder}; wait until it has ended, or name another folder with --results"
+        ) from error
+    return file
 
 
 def describe_machine() -> Row:
@@ -149,12 +236,14 @@ def now() -> str:
     return datetime.now(UTC).isoformat(sep=" ", timespec="milliseconds").removesuffix("+00:00")
 
 
-def write_json(path: Path, told: Row) -> None:
+def write_json(path: Path, content: Row) -> None:
     """Write plain values, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(_as_json(told), encoding="utf-8")
-    os.replace(part, path)
+    write_whole(path, json.dumps(content, indent=1, default=float).encode() + b"\n")
+
+
+def write_start_curves(folder: Path, curves: dict[str, Curve]) -> None:
+    """Write the fits of the published method from several starts, by name."""
+    write_whole(folder / _START_CURVES, json.dumps(curves).encode() + b"\n")
 
 
 def write_picture(path: Path, picture: NDArray[np.floating]) -> None:
@@ -170,8 +259,10 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_")
 
 
-def _as_json(told: Row) -> str:
-    return json.dumps(told, indent=1, default=float)
+def _read_json(path: Path) -> Row:
+    """Return what a file holds; nothing where there is no file."""
+    content: Row = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return content
 
 
 def _version(name: str) -> str | None:

@@ -18,8 +18,8 @@ def median_seconds(code: str) -> float:
     """Run code some times with one thread; return the median of the seconds it prints."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-c", code]
-    told = [subprocess.run(command, capture_output=True, check=True, env=environment).stdout for _ in range(RUNS)]
-    return statistics.median(float(text) for text in told)
+    printed = [subprocess.run(command, capture_output=True, check=True, env=environment).stdout for _ in range(RUNS)]
+    return statistics.median(float(text) for text in printed)
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """PyFibreBundle (Hughes, 2023), the package itself, run as a script by a Python that has it.
 
-It lives in an environment of its own, for its OpenCV brings a Qt that clashes with napari's; so this file imports
+It lives in an environment of its own, because its OpenCV brings a Qt that clashes with napari's; so this file imports
 nothing of this project. It reads an npz and writes one:
 
     .venv-peers/bin/python benchmarks/peers/pyfibrebundle.py single|super IN.npz OUT.npz
@@ -20,15 +20,15 @@ from pybundle import SuperRes
 from scipy.ndimage import distance_transform_edt
 
 
-def single_calibration(told):
+def single_calibration(inputs):
     """Calibrate for one frame: where the cores are, and how bright each is."""
-    half = (float(told["size"]) - 1) / 2
-    centre_x, centre_y, grid = float(told["x"]) + half, float(told["y"]) + half, int(told["grid"])
-    look = {"filterSize": None, "normalise": told["bundle"], "mask": False}
-    if "centres" not in told:
+    half = (float(inputs["size"]) - 1) / 2
+    centre_x, centre_y, grid = float(inputs["x"]) + half, float(inputs["y"]) + half, int(inputs["grid"])
+    look = {"filterSize": None, "normalise": inputs["bundle"], "mask": False}
+    if "centres" not in inputs:
         return pybundle.calib_tri_interp(
-            told["bundle"],
-            float(told["pitch"]),
+            inputs["bundle"],
+            float(inputs["pitch"]),
             grid,
             centreX=centre_x,
             centreY=centre_y,
@@ -36,46 +36,46 @@ def single_calibration(told):
             autoMask=True,
             **look,
         )
-    height, width = told["bundle"].shape
-    places = np.rint(told["centres"]).astype(int)
+    height, width = inputs["bundle"].shape
+    places = np.rint(inputs["centres"]).astype(int)
     inside = ((places >= 0) & (places < (width, height))).all(axis=1)
     x, y = places[inside].astype("uint16").T
-    lit = told["bundle"][y, x] > 0.05  # dead cores are known too
-    calibration = pybundle.init_tri_interp(told["bundle"], x[lit], y[lit], centre_x, centre_y, half, grid, **look)
+    lit = inputs["bundle"][y, x] > 0.05  # dead cores are known too
+    calibration = pybundle.init_tri_interp(inputs["bundle"], x[lit], y[lit], centre_x, centre_y, half, grid, **look)
     calibration.nCores = int(lit.sum())
     return calibration
 
 
-def one_frame(told, calibration):
+def one_frame(inputs, calibration):
     """Interpolate between the cores of frame 0."""
-    channels = np.moveaxis(told["frames"][0], -1, 0)
+    channels = np.moveaxis(inputs["frames"][0], -1, 0)
     pictures = [pybundle.recon_tri_interp(channel, calibration, numba=False) for channel in channels]
     # What is normalised comes with 255 as full scale.
     return filled(np.stack(pictures, axis=-1) / 255, calibration)
 
 
-def all_frames(told, calibration):
+def all_frames(inputs, calibration):
     """Register the frames by translation, as the package does, and interpolate between the cores of all.
 
     Its registration gets the whole frame as reference and half of it as template, so that it finds shifts up to a
     quarter of the frame. Other sizes, frames without their mean or their shading, frames brought to one mean and the
     true shifts were tried on the bursts of the first table: all within half a decibel, none better throughout.
     """
-    stacks = np.moveaxis(told["frames"], 0, 2)  # (H, W, T, C)
-    grid, half = int(told["grid"]), calibration.radius
+    stacks = np.moveaxis(inputs["frames"], 0, 2)  # (H, W, T, C)
+    grid, half = int(inputs["grid"]), calibration.radius
     drawn = [
         pybundle.recon_tri_interp(stacks[..., t, :].mean(axis=-1), calibration, numba=False)
         for t in range(stacks.shape[2])
     ]
     shifts = SuperRes.get_shifts(np.stack(drawn, axis=-1), templateSize=grid // 4, refSize=grid // 2, upsample=4)
     shifts = np.asarray(shifts, float) * 2 * half / grid
-    centre = {"centreX": told["x"] + half, "centreY": told["y"] + half, "radius": half}
+    centre = {"centreX": inputs["x"] + half, "centreY": inputs["y"] + half, "radius": half}
     pictures = []
     for channel in range(stacks.shape[3]):
         combined = SuperRes.calib_multi_tri_interp(
-            told["bundle"],
+            inputs["bundle"],
             stacks[..., channel],
-            float(told["pitch"]),
+            float(inputs["pitch"]),
             grid,
             shifts=shifts,
             singleCalib=calibration,
@@ -98,9 +98,9 @@ def main():
     """Read, reconstruct, write."""
     method, given, wanted = sys.argv[1:]
     with np.load(given) as file:
-        told = {name: file[name] for name in file.files}
+        inputs = {name: file[name] for name in file.files}
     start = time.perf_counter()
-    picture = {"single": one_frame, "super": all_frames}[method](told, single_calibration(told))
+    picture = {"single": one_frame, "super": all_frames}[method](inputs, single_calibration(inputs))
     seconds = time.perf_counter() - start
     np.savez(wanted, picture=picture.astype(np.float32), seconds=seconds)
 

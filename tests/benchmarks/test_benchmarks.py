@@ -11,10 +11,10 @@ from benchmarks.cases import Case
 from benchmarks.chart import PLACES, Shown, period_of
 from benchmarks.compare import compare
 from benchmarks.methods import METHODS, Effort, PeerError
-from benchmarks.results import CONDITIONS, SCENES, Results
+from benchmarks.results import CONDITIONS, SCENES, Recorder, Results, write_start_curves
 
 from benchmarks import __main__ as command
-from benchmarks import cases, chart, methods, publish, report
+from benchmarks import cases, chart, methods, publish, published_start, report, results
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.quality import psnr
 from napari_fiberburst.results.reconstruction import Canvas
@@ -29,44 +29,98 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
         computed.append(number)
         return {"psnr": float(number)}
 
-    first = Results(tmp_path, "quick")
-    for number in range(3):
-        first.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
-    again = Results(tmp_path, "quick", resume=True)
-    for number in range(5):
-        row = again.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
-        assert row["psnr"] == number
+    with Recorder(tmp_path, "quick") as first:
+        for number in range(3):
+            first.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
+    with Recorder(tmp_path, "quick", resume=True) as again:
+        for number in range(5):
+            row = again.row(SCENES, f"case {number}", "default", lambda number=number: compute(number))
+            assert row["psnr"] == number
     assert computed == [0, 1, 2, 3, 4]
-    assert [row["case"] for row in again.rows(SCENES)] == [f"case {number}" for number in range(5)]
+    assert [row["case"] for row in again.results.rows(SCENES)] == [f"case {number}" for number in range(5)]
+
+
+def test_a_row_that_was_cut_off_is_dropped_with_a_word_and_measured_again(tmp_path, capsys):
+    with Recorder(tmp_path, "quick") as first:
+        for case in ("a", "b"):
+            first.row(SCENES, case, "default", lambda: {"psnr": 1.0})
+    path = first.results.rows_file(SCENES)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-9])
+    assert [row["case"] for row in Results(tmp_path).rows(SCENES)] == ["a"]
+    with Recorder(tmp_path, "quick", resume=True) as again:
+        assert f"dropped the last line of {path}" in capsys.readouterr().out
+        for case in ("a", "b"):
+            again.row(SCENES, case, "default", lambda: {"psnr": 2.0})
+    assert [(row["case"], row["psnr"]) for row in again.results.rows(SCENES)] == [("a", 1.0), ("b", 2.0)]
+
+
+def test_a_row_that_is_done_is_in_the_file_before_the_next_begins(tmp_path):
+    with Recorder(tmp_path, "quick") as recorder:
+        recorder.row(SCENES, "a", "default", lambda: {"psnr": 1.0})
+        seen = []
+        recorder.row(SCENES, "b", "default", lambda: seen.extend(Results(tmp_path).rows(SCENES)) or {"psnr": 2.0})
+    assert [row["case"] for row in seen] == ["a"]
+
+
+def test_a_line_that_is_no_row_is_named(tmp_path):
+    with Recorder(tmp_path, "quick") as recorder:
+        recorder.row(SCENES, "a", "default", lambda: {"psnr": 1.0})
+    path = recorder.results.rows_file(SCENES)
+    path.write_bytes(path.read_bytes() + b'{"psnr": 3}\n')
+    with pytest.raises(OutputError, match=r"line 2 of .*1_scenes\.jsonl is no row: expected a JSON object with case"):
+        recorder.results.rows(SCENES)
+
+
+def test_one_run_at_a_time_writes_into_a_folder(tmp_path):
+    with Recorder(tmp_path, "quick"), pytest.raises(OutputError, match="another run is writing into"):
+        Recorder(tmp_path, "quick", resume=True)
+    with Recorder(tmp_path, "quick", resume=True) as later:
+        assert later.row(SCENES, "a", "default", lambda: {"psnr": 1.0})["psnr"] == 1
 
 
 def test_results_are_not_overwritten_unasked(tmp_path):
-    Results(tmp_path, "quick").row(SCENES, "a", "default", lambda: {"psnr": 1.0, "picture": np.zeros((5, 7))})
+    with Recorder(tmp_path, "quick") as recorder:
+        recorder.row(SCENES, "a", "default", lambda: {"psnr": 1.0, "picture": np.zeros((5, 7))})
     with pytest.raises(OutputError, match=r"--resume goes on with them, --overwrite"):
-        Results(tmp_path, "quick")
+        Recorder(tmp_path, "quick")
     with pytest.raises(OutputError, match="name another folder"):
-        Results(tmp_path, "full", resume=True)
-    emptied = Results(tmp_path, "full", overwrite=True)
-    assert list(emptied.rows(SCENES)) == []
-    assert emptied.picture(SCENES, "a", "default") is None
-    assert emptied.about["mode"] == "full"
+        Recorder(tmp_path, "full", resume=True)
+    with Recorder(tmp_path, "full", overwrite=True) as emptied:
+        left = emptied.results
+    assert left.rows(SCENES) == []
+    assert left.picture(SCENES, "a", "default") is None
+    assert left.about["mode"] == "full"
 
 
 def test_every_row_says_where_it_came_from(tmp_path):
-    results = Results(tmp_path, "quick")
-    compare(results, CONDITIONS, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=False)
-    for row in results.rows(CONDITIONS):
+    with Recorder(tmp_path, "quick") as recorder:
+        compare(recorder, CONDITIONS, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=False)
+    for row in recorder.results.rows(CONDITIONS):
         assert row["burst"]["seed"] == 3
         assert row["date"] >= "2026"
         assert "commit" in row
-    assert {"torch", "numpy"} <= set(results.about["versions"])
+    assert {"torch", "numpy"} <= set(recorder.results.about["versions"])
+
+
+def test_rows_of_another_machine_are_said_to_be_so(tmp_path, monkeypatch):
+    with Recorder(tmp_path, "quick") as recorder:
+        machine = recorder.results.about["processor"]
+    measured = results.describe_machine()
+    monkeypatch.setattr(results, "describe_machine", lambda: {**measured, "processor": "an abacus"})
+    for _ in range(2):
+        with Recorder(tmp_path, "quick", resume=True) as later:
+            text = report.in_markdown(later.results)
+        assert "an abacus" in text.split("Rows before")[0]
+        assert machine in text.split("Rows before")[1]
+        assert text.count("Rows before") == 1
 
 
 def test_a_peer_that_is_missing_has_its_row(tmp_path, monkeypatch):
     monkeypatch.setattr(methods, "PEER_PYTHON", tmp_path / "no python")
-    results = Results(tmp_path, "quick")
-    compare(results, SCENES, [SMALL], ["captured", "pyfibrebundle"], Effort(), pictures=True)
-    tables = report.write(results).read_text(encoding="utf-8")
+    with Recorder(tmp_path, "quick") as recorder:
+        compare(recorder, SCENES, [SMALL], ["captured", "pyfibrebundle"], Effort(), pictures=True)
+    tables = report.write(recorder.results).read_text(encoding="utf-8")
     assert "not installed: make peers" in tables
     assert "captured frame" in tables
 
@@ -201,37 +255,114 @@ def test_a_lattice_shows_in_the_ring():
 
 
 def test_the_report_is_valid_where_little_is_there(tmp_path):
-    results = Results(tmp_path, "quick")
-    assert "Measured" in report.write(results).read_text(encoding="utf-8")
+    with Recorder(tmp_path, "quick") as recorder:
+        pass
+    assert "Measured" in report.write(recorder.results).read_text(encoding="utf-8")
     assert json.loads((tmp_path / "about.json").read_text())["mode"] == "quick"
 
 
-def test_what_is_published_finds_its_figures(tmp_path, monkeypatch):
-    results = Results(tmp_path / "results", "quick")
-    compare(results, SCENES, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=True)
-    report.write(results)
+@pytest.fixture
+def measured(tmp_path):
+    """Return a results folder with two methods of the first table."""
+    with Recorder(tmp_path / "results", "quick") as recorder:
+        compare(recorder, SCENES, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=True)
+    return recorder.results
+
+
+def test_what_is_published_finds_its_figures(measured, tmp_path, monkeypatch):
     target = tmp_path / "docs" / "results"
-    monkeypatch.setattr(sys, "argv", ["publish", str(target), "--results", str(results.folder)])
-    publish.main()
+    monkeypatch.setattr(sys, "argv", ["publish", str(target), "--results", str(measured.folder)])
+    assert publish.main() == 0
     links = re.findall(r"\]\((.+?)\)", (target.parent / "tables.md").read_text(encoding="utf-8"))
-    assert links
+    assert "results/figures/scenes.webp" in links
     assert all((target.parent / link).exists() for link in links)
 
 
+def test_rows_measured_later_are_merged_into_what_is_published(measured, tmp_path, capsys):
+    target = tmp_path / "docs" / "results"
+    publish.publish(measured.folder, target, [1])
+    with Recorder(tmp_path / "later", "quick") as later:
+        later.row(SCENES, "small", "gaussian-fixed", lambda: {**measured.rows(SCENES)[2], "psnr": 99.0})
+        later.row(CONDITIONS, "small", "captured", lambda: measured.rows(SCENES)[1])
+    before = (target / "figures" / "scenes.webp").read_bytes()
+    publish.publish(later.results.folder, target, [1])
+    merged = Results(target)
+    assert [row["method"] for row in merged.rows(SCENES)] == ["truth", "captured", "gaussian-fixed"]
+    assert merged.rows(SCENES)[:2] == measured.rows(SCENES)[:2]
+    assert merged.rows(SCENES)[2]["psnr"] == 99
+    assert merged.rows(CONDITIONS) == []
+    assert "99.00" in (target.parent / "tables.md").read_text(encoding="utf-8")
+    assert "scenes.webp stays as it was" in capsys.readouterr().out
+    assert (target / "figures" / "scenes.webp").read_bytes() == before
+    publish.publish(later.results.folder, target, [1, 3], overwrite=True)
+    assert [row["method"] for row in merged.rows(SCENES)] == ["gaussian-fixed"]
+    assert [row["method"] for row in merged.rows(CONDITIONS)] == ["captured"]
+
+
+def test_rows_of_two_kinds_of_run_are_not_published_together(measured, tmp_path, monkeypatch, capsys):
+    target = tmp_path / "docs" / "results"
+    publish.publish(measured.folder, target, [1])
+    with Recorder(tmp_path / "full", "full") as full:
+        full.row(SCENES, "small", "captured", lambda: measured.rows(SCENES)[1])
+    arguments = ["publish", str(target), "--results", str(tmp_path / "full")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    assert publish.main() == 2
+    assert "has rows of a quick run" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", [*arguments, "--overwrite"])
+    assert publish.main() == 0
+    assert [row["method"] for row in Results(target).rows(SCENES)] == ["captured"]
+
+
+def test_nothing_measured_is_nothing_to_publish(tmp_path):
+    with pytest.raises(OutputError, match=r"has no rows of tables \[1, 3\]; measure them"):
+        publish.publish(tmp_path / "empty", tmp_path / "docs" / "results", [1, 3])
+
+
+def test_curves_of_the_published_start_come_with_their_figure(measured, tmp_path):
+    target = tmp_path / "docs" / "results"
+    publish.publish(measured.folder, target, [1])
+    curves = {"one start": [(40, 17.0, 0.2, 3.0), (80, 21.0, 0.3, 1.5), (120, 20.5, 0.3, 1.25)]}
+    write_start_curves(tmp_path / "starts", curves)
+    publish.publish(tmp_path / "starts", target, [1])
+    write_start_curves(tmp_path / "others", {"another start": [(40, 16.0, 0.1, 4.0)]})
+    publish.publish(tmp_path / "others", target, [1])
+    tables = (target.parent / "tables.md").read_text(encoding="utf-8")
+    assert "| one start | 21.0 / 0.30 at step 80 | 20.5 / 0.30 at step 120 | 1.25 px |" in tables
+    assert "| another start | 16.0 / 0.10 at step 40 |" in tables
+    assert "(results/figures/published_start.webp)" in tables
+    assert (target / "figures" / "published_start.webp").exists()
+    assert [row["method"] for row in Results(target).rows(SCENES)] == ["truth", "captured", "gaussian-fixed"]
+
+
+def test_the_identity_as_start_changes_the_motion_alone():
+    burst = SMALL.make().burst
+    published, still = (published_start.unfitted(burst, 5.0) for _ in range(2))
+    published_start.start_at_identity(still)
+    assert np.abs(published.renderer.homographies()[1:] - np.eye(3)).max() > 0.1
+    np.testing.assert_array_equal(still.renderer.homographies(), np.tile(np.eye(3), (6, 1, 1)))
+    scenes = [result.renderer.field.scene.state_dict() for result in (published, still)]
+    assert all(np.array_equal(scenes[0][name], scenes[1][name]) for name in scenes[0])
+    assert published.losses.size == 0
+
+
 def test_a_row_whose_peer_was_missing_is_measured_again(tmp_path):
-    Results(tmp_path, "quick").row(SCENES, "a", "unet", lambda: {"missing": "not installed"})
-    row = Results(tmp_path, "quick", resume=True).row(SCENES, "a", "unet", lambda: {"psnr": 20.0})
-    assert row["psnr"] == 20
+    with Recorder(tmp_path, "quick") as first:
+        first.row(SCENES, "a", "unet", lambda: {"missing": "not installed"})
+    with Recorder(tmp_path, "quick", resume=True) as again:
+        assert again.row(SCENES, "a", "unet", lambda: {"psnr": 20.0})["psnr"] == 20
 
 
-def test_a_row_of_another_recipe_is_measured_again(tmp_path):
-    Results(tmp_path, "quick").row(SCENES, "a", "paper", lambda: {"psnr": 1.0}, {"paper_iterations": 30})
-    again = Results(tmp_path, "quick", resume=True)
-    assert again.row(SCENES, "a", "paper", lambda: {"psnr": 2.0}, {"paper_iterations": 30})["psnr"] == 1
-    assert again.row(SCENES, "a", "paper", lambda: {"psnr": 3.0}, {"paper_iterations": 3000})["psnr"] == 3
+def test_a_row_of_another_recipe_takes_the_place_of_the_old_one(tmp_path):
+    with Recorder(tmp_path, "quick") as first:
+        for method in ("paper", "unet"):
+            first.row(SCENES, "a", method, lambda: {"psnr": 1.0}, {"paper_iterations": 30})
+    with Recorder(tmp_path, "quick", resume=True) as again:
+        assert again.row(SCENES, "a", "paper", lambda: {"psnr": 2.0}, {"paper_iterations": 30})["psnr"] == 1
+        assert again.row(SCENES, "a", "paper", lambda: {"psnr": 3.0}, {"paper_iterations": 3000})["psnr"] == 3
+    assert [(row["method"], row["psnr"]) for row in again.results.rows(SCENES)] == [("paper", 3.0), ("unet", 1.0)]
 
 
-def test_a_failed_fit_is_told_and_leaves_the_tables(tmp_path, monkeypatch, capsys):
+def test_a_failed_fit_is_reported_and_leaves_the_tables(tmp_path, monkeypatch, capsys):
     arguments = ["--quick", "--tables", "5", "--device", "abacus", "--results", str(tmp_path / "new")]
     monkeypatch.setattr(sys, "argv", ["benchmarks", *arguments])
     assert command.main() == 2
