@@ -60,6 +60,25 @@ class SettingsForm(QWidget):
         self._connect()
 
     @property
+    def rows(self) -> Mapping[str, KnobRow]:
+        """The knobs' rows by name, also of those that do not apply."""
+        return self._rows
+
+    @property
+    def boxes(self) -> Mapping[str, QComboBox]:
+        """Where preset, motion, encoding and device are chosen."""
+        return {"preset": self._preset, "motion": self._motion, "encoding": self._encoding, "device": self._device}
+
+    @property
+    def shown(self) -> set[str]:
+        """Names of the knobs that apply: those whose rows can be seen."""
+        return {
+            name
+            for name, row in self._rows.items()
+            if any(layout.indexOf(row) >= 0 and layout.isRowVisible(row) for layout in (self._first, self._rest))
+        }
+
+    @property
     def preset(self) -> str:
         """The preset's name."""
         return self._preset.currentText()
