@@ -42,5 +42,7 @@ class CopyButtons(QWidget):
         except FiberBurstError as error:
             show_error(str(error))
             return
-        QApplication.clipboard().setText(text)
+        clipboard = QApplication.clipboard()
+        if clipboard is not None:
+            clipboard.setText(text)
         self.copied.emit("copied to the clipboard")

@@ -177,7 +177,8 @@ class AnimationThrottle:
 
     def slow(self, window: QWidget) -> None:
         """Slow down what moves in a window."""
-        self._slowed = [label.movie() for label in window.findChildren(QLabel) if label.movie() is not None]
+        movies = [label.movie() for label in window.findChildren(QLabel)]
+        self._slowed = [movie for movie in movies if movie is not None]
         for movie in self._slowed:
             movie.setSpeed(_SLOW)
 

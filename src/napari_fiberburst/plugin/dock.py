@@ -126,9 +126,9 @@ class FiberBurstWidget(QWidget):
         """Ask for a narrow dock: the picture is what matters."""
         return QSize(_WIDTH, super().sizeHint().height())
 
-    def event(self, event: QEvent) -> bool:
+    def event(self, event: QEvent | None) -> bool:
         """Notice when the dock is closed for good: napari takes the widget out of it, and does not delete it."""
-        if event.type() == QEvent.Type.ParentChange:
+        if event is not None and event.type() == QEvent.Type.ParentChange:
             if self.parent() is None and self._was_docked:
                 self.shut_down()
                 self._follow_state("ready")
@@ -209,7 +209,7 @@ class FiberBurstWidget(QWidget):
         if is_ready:
             self._throttle.restore()
         else:
-            self._throttle.slow(self.window())
+            self._throttle.slow(self.window() or self)
         self.start_button.setEnabled(is_ready)
         self.pause_button.setEnabled(state in ("running", "paused"))
         self.pause_button.setText("Continue" if state == "paused" else "Pause")
@@ -258,7 +258,7 @@ class FiberBurstWidget(QWidget):
     def _new_name(self) -> str:
         """Return the first name that no run of this viewer has."""
         taken = {layer.metadata.get(METADATA_KEY, {}).get("run") for layer in self._viewer.layers}
-        for dock in self.window().findChildren(FiberBurstWidget):  # a run may have no layer yet
+        for dock in (self.window() or self).findChildren(FiberBurstWidget):  # a run may have no layer yet
             taken |= {run.name for run in dock.runs.runs}
         return next(name for number in count(1) if (name := f"run {number}") not in taken)
 

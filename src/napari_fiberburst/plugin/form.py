@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from qtpy.QtCore import Qt, Signal
+from qtpy.QtGui import QStandardItemModel
 from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.errors import SettingsError
@@ -133,8 +134,11 @@ class SettingsForm(QWidget):
 
     def show_devices(self, missing: Mapping[str, str]) -> None:
         """Lock the devices that are not on this machine, and say why: {name: reason}."""
+        model = self._device.model()
+        assert isinstance(model, QStandardItemModel)  # a combo box's own
         for number, name in enumerate(_DEVICES):
-            item = self._device.model().item(number)
+            item = model.item(number)
+            assert item is not None
             item.setEnabled(name not in missing)
             item.setToolTip(missing.get(name, ""))
 
@@ -243,7 +247,8 @@ class SettingsForm(QWidget):
             box.blockSignals(False)
         for layout in (self._first, self._rest):
             for number in range(layout.rowCount()):
-                row = layout.itemAt(number, QFormLayout.ItemRole.FieldRole).widget()
+                item = layout.itemAt(number, QFormLayout.ItemRole.FieldRole)
+                row = None if item is None else item.widget()
                 if isinstance(row, KnobRow):
                     layout.setRowVisible(number, row.knob.name in settings.knobs)
         named = {"motion": settings.motion.name, "encoding": settings.encoding.name}

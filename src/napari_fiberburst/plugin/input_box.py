@@ -68,9 +68,12 @@ class InputBox(QWidget):
         """The burst's layers: the one chosen, and those that are further channels of it."""
         if self.burst.value is None:
             return []
-        states = [self.channels.item(row).checkState() for row in range(self.channels.count())]
-        checked = Qt.CheckState.Checked
-        further = [layer for layer, state in zip(self._listed, states, strict=True) if state == checked]
+        items = [self.channels.item(row) for row in range(self.channels.count())]
+        further = [
+            layer
+            for layer, item in zip(self._listed, items, strict=True)
+            if item is not None and item.checkState() == Qt.CheckState.Checked
+        ]
         return [self.burst.value, *further]
 
     def source(self) -> BurstSource:

@@ -241,7 +241,8 @@ class RunsPanel(QWidget):
     def _follow(self) -> None:
         """Offer what makes sense for the run that is selected."""
         run = self.run
-        has_result = run is not None and run.result is not None
+        result = None if run is None else run.result
+        has_result = result is not None
         self._summary.setText("" if run is None else run.summary)
         self._summary.setVisible(has_result)
         for button in (self.save_button, self.save_motion_button):
@@ -263,7 +264,7 @@ class RunsPanel(QWidget):
             self.other.setCurrentIndex(others.index(before))
         self.other.blockSignals(False)
         self.compare_button.setEnabled(bool(others))
-        is_network = has_result and not isinstance(run.result.settings.encoding, Spline)
+        is_network = result is not None and not isinstance(result.settings.encoding, Spline)
         self.continue_button.setEnabled(is_network and not self._is_running)
         self._more_steps.setEnabled(is_network and not self._is_running)
         self.continue_button.setToolTip(
@@ -295,30 +296,32 @@ class RunsPanel(QWidget):
 
     def _ask_and_save(self) -> None:
         run = self.run
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save result", f"{run.name}.ome.tif", "OME-TIFF and JSON (*.ome.tif);;Representation (*.npz)"
-        )
-        if path:
-            self.save_result(run, path)
+        if run is not None:
+            path = self._ask(
+                "Save result", f"{run.name}.ome.tif", "OME-TIFF and JSON (*.ome.tif);;Representation (*.npz)"
+            )
+            if path:
+                self.save_result(run, path)
 
     def _ask_and_save_motion(self) -> None:
         run = self.run
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save homographies", f"{run.name} homographies.csv", "CSV (*.csv);;JSON (*.json)"
-        )
-        if path:
-            self.save_homographies(run, path)
+        if run is not None:
+            path = self._ask("Save homographies", f"{run.name} homographies.csv", "CSV (*.csv);;JSON (*.json)")
+            if path:
+                self.save_homographies(run, path)
 
     def _ask_and_keep(self) -> None:
         run = self.run
-        if run is None:
-            return
-        name = None if run.bundle is None else run.bundle.path
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Keep bundle", name or f"{run.source.name}.bundle", "Bundle (*.bundle)"
-        )
-        if path:
-            self.keep_bundle(run, path)
+        if run is not None:
+            given = None if run.bundle is None else run.bundle.path
+            path = self._ask("Keep bundle", given or f"{run.source.name}.bundle", "Bundle (*.bundle)")
+            if path:
+                self.keep_bundle(run, path)
+
+    def _ask(self, title: str, suggested: str, kinds: str) -> str:
+        """Return where the user wants a file; "" where nowhere."""
+        path, _ = QFileDialog.getSaveFileName(self, title, suggested, kinds)
+        return str(path)
 
 
 def _try(write: Callable[[], object], path: str | Path) -> None:
