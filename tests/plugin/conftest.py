@@ -32,8 +32,8 @@ def simulated() -> SimulatedBurst:
 def burst_layer(simulated) -> Image:
     """Return the burst as a sample layer has it, its truth in the metadata."""
     arrays = simulated.arrays()
-    told = {"truth": arrays["truth"], "homographies": arrays["homographies"], "recipe": {"scene": "histology"}}
-    return Image(arrays["frames"], rgb=True, name="burst", metadata={"fiberburst": told})
+    metadata = {"truth": arrays["truth"], "homographies": arrays["homographies"], "recipe": {"scene": "histology"}}
+    return Image(arrays["frames"], rgb=True, name="burst", metadata={"fiberburst": metadata})
 
 
 @pytest.fixture

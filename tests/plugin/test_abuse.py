@@ -180,4 +180,4 @@ def test_a_dock_put_back_follows_the_layers_again(open_dock, burst_layer, grey_f
     viewer.window.remove_dock_widget(dock.parent())
     viewer.window.add_dock_widget(dock, name="again")
     viewer.add_layer(Image(grey_frames, name="late"))
-    assert dock.input.burst.findText("late") >= 0
+    assert dock.input.burst.native.findText("late") >= 0

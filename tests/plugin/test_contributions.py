@@ -29,19 +29,19 @@ def test_every_scene_is_a_sample_in_both_physics():
 
 def test_opening_a_menu_loads_no_torch():
     code = "import napari_fiberburst.plugin.contributions, sys; print('torch' in sys.modules, 'napari' in sys.modules)"
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert told.split() == ["False", "False"]
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.split() == ["False", "False"]
 
 
 @pytest.mark.parametrize("key", ["retina_core", "usaf_mask"])
 def test_a_sample_carries_its_truth(key):
     ((frames, look, kind),) = getattr(contributions, key)()
-    told = look["metadata"]["fiberburst"]
+    metadata = look["metadata"]["fiberburst"]
     assert kind == "image"
-    assert frames.shape[:3] == told["truth"].shape[:3] == (20, 256, 256)
+    assert frames.shape[:3] == metadata["truth"].shape[:3] == (20, 256, 256)
     assert frames.dtype == np.uint8
     assert look["rgb"] == (frames.ndim == 4)
-    assert told["homographies"].shape == (20, 3, 3)
+    assert metadata["homographies"].shape == (20, 3, 3)
 
 
 def test_an_npz_burst_opens_with_its_truth(tmp_path, simulated):
@@ -113,8 +113,8 @@ def test_results_are_saved_from_the_list_of_runs(open_dock, run_through, burst_l
     dock.runs.save_homographies(run, tmp_path / "h.json")
     table = np.loadtxt(tmp_path / "h.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(table[:, 1:].reshape(-1, 3, 3), run.result.homographies)
-    told = json.loads((tmp_path / "h.json").read_text())["frames"]
-    np.testing.assert_array_equal([frame["homography"] for frame in told], run.result.homographies)
+    stored = json.loads((tmp_path / "h.json").read_text())["frames"]
+    np.testing.assert_array_equal([frame["homography"] for frame in stored], run.result.homographies)
     assert (tmp_path / "p.json").exists()
     before = sorted(tmp_path.iterdir())
     dock.runs.save_homographies(run, tmp_path / "h.txt")

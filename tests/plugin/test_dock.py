@@ -106,11 +106,11 @@ def test_sigma_can_be_turned_while_running(open_dock, qtbot, burst_layer):
     dock.form.set_choices({**NETWORK, "sigma": 2.0})
     with qtbot.waitSignal(dock.runner.reported, timeout=MILLISECONDS):
         dock.start()
-    rows = dock.form._rows
+    rows = dock.form.rows
     assert rows["sigma"].isEnabled()
     assert rows["learning_rate"].isEnabled()
     assert not rows["features"].isEnabled()
-    rows["sigma"]._editor.setValue(3.5)
+    rows["sigma"].editor.value = 3.5
     with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
         pass
     assert dock.runs.run.result.settings.method.encoding.sigma == 3.5
@@ -129,15 +129,15 @@ def test_a_network_goes_on_for_more_steps(open_dock, qtbot, run_through, burst_l
 def test_a_spline_has_nothing_to_go_on_for(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     run_through(dock)
-    assert not dock.runs._continue.isEnabled()
-    assert "solved to its end" in dock.runs._continue.toolTip()
+    assert not dock.runs.continue_button.isEnabled()
+    assert "solved to its end" in dock.runs.continue_button.toolTip()
 
 
 def test_open_settings_say_what_was_chosen(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
     chosen = run.result.settings.method.smoothness
-    assert dock.form._rows["smoothness"]._auto.text() == f"auto ({chosen:.3g})"
+    assert dock.form.rows["smoothness"].auto.text() == f"auto ({chosen:.3g})"
     assert "smoothness" not in dock.form.choices()
 
 
@@ -152,7 +152,7 @@ def test_the_form_is_as_it_was_left(open_dock, burst_layer):
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
-    assert len(run.history.moments) >= 2
+    assert len(run.history.snapshots) >= 2
     final = viewer.layers["run 1: picture"].data.copy()
     dock.display.slider.setValue(0)
     early = viewer.layers["run 1: picture"].data
@@ -184,8 +184,8 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
 def test_a_continued_run_keeps_its_calibration_image(open_dock, qtbot, run_through, burst_layer, simulated):
     even = Image(np.repeat(255 * simulated.transmission[..., None], 3, axis=2), rgb=False, name="even")
     _, dock = open_dock(burst_layer, even)
-    dock.input.burst.choose(burst_layer)
-    dock.input.calibration.choose(even)
+    dock.input.burst.value = burst_layer
+    dock.input.bundle.value = even
     dock.form.set_choices({**NETWORK, "iterations": 5})
     first = run_through(dock)
     with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
@@ -199,11 +199,11 @@ def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)
     run_through(dock)
-    dock.runs._list.item(0).setText("sharp")
+    dock.runs.list_of_runs.item(0).setText("sharp")
     assert "sharp: picture" in viewer.layers
     assert viewer.layers["sharp: picture"].metadata["fiberburst"]["run"] == "sharp"
-    dock.runs._list.item(0).setText(" ")
-    assert dock.runs._list.item(0).text() == "sharp"
+    dock.runs.list_of_runs.item(0).setText(" ")
+    assert dock.runs.list_of_runs.item(0).text() == "sharp"
 
 
 def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_layer):
@@ -220,10 +220,10 @@ def test_comparing_shows_one_picture_alone(open_dock, run_through, burst_layer):
     dock.form.set_choices(QUICK)
     for _ in range(3):
         run_through(dock)
-    dock.runs._list.setCurrentRow(0)
-    dock.runs._other.setCurrentIndex(0)
-    dock.runs._compare.click()
+    dock.runs.list_of_runs.setCurrentRow(0)
+    dock.runs.other.setCurrentIndex(0)
+    dock.runs.compare_button.click()
     assert [viewer.layers[f"run {number}: picture"].visible for number in (1, 2, 3)] == [False, True, False]
     dock.runs.remove(dock.runs.runs[1])
-    assert not dock.runs._compare.isChecked()
+    assert not dock.runs.compare_button.isChecked()
     assert [viewer.layers[f"run {number}: picture"].visible for number in (1, 3)] == [True, False]

@@ -47,7 +47,7 @@ def test_a_burst_with_nan_is_refused_in_one_notification(open_dock, qtbot, grey_
 def test_a_region_limits_the_run(open_dock, run_through, burst_layer):
     corners = np.array([[5.0, 8.0], [5.0, 47.0], [40.0, 47.0], [40.0, 8.0]])
     viewer, dock = open_dock(burst_layer, Shapes([corners], shape_type="rectangle", name="look here"))
-    dock.input.region.choose(viewer.layers["look here"])
+    dock.input.region.value = viewer.layers["look here"]
     run = run_through(dock)
     picture = viewer.layers["run 1: picture"]
     assert run.result.image.shape == (36, 40, 3)
@@ -90,10 +90,10 @@ def test_grey_layers_make_one_burst(open_dock, run_through, qtbot, simulated):
     frames = simulated.arrays()["frames"]
     names = ("red", "green")
     viewer, dock = open_dock(*(Image(frames[..., number], name=name) for number, name in enumerate(names)))
-    dock.input.burst.choose(viewer.layers["red"])
-    item = dock.input._channels.item(0)
+    dock.input.burst.value = viewer.layers["red"]
+    item = dock.input.channels.item(0)
     assert item.text() == "green"
-    item.setCheckState(dock.input._channels.item(0).checkState().Checked)
+    item.setCheckState(dock.input.channels.item(0).checkState().Checked)
     run = run_through(dock)
     assert run.result.image.shape == (63, 75, 2)
     assert run.result.acquisition.channel_names == names

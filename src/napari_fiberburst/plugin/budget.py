@@ -1,4 +1,4 @@
-"""Whether a run fits into memory, told before it starts."""
+"""Whether a run fits into memory, asked before it starts."""
 
 from collections.abc import Mapping
 from typing import Any

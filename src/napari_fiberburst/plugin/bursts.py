@@ -46,7 +46,7 @@ class BurstSource:
     arrays : tuple of array
         Their data, numpy or dask.
     axes : str
-        Order of the axes of each array, such as "TYX", "TYXC" or "CTYX".
+        Order of the axes of each array, such as "TYX", "TYXC" or "CTYX"; one frame has no T.
     region : ((int, int), (int, int)) or None
         Rows and columns, half-open, of the part that is used.
     pixel_size : (float, float) or None
@@ -81,15 +81,15 @@ class BurstSource:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """(T, H, W, C) of the burst, by the axes given.
+        """(T, H, W, C) of the burst, by the axes given; without T it is one frame.
 
         Raises
         ------
         BurstError
-            The axes do not fit the data, or there is no axis of frames.
+            The axes do not fit the data.
         """
         data = self.arrays[0]
-        if len(self.axes) != data.ndim or len(set(self.axes)) != data.ndim or not {"T", "Y", "X"} <= set(self.axes):
+        if len(self.axes) != data.ndim or len(set(self.axes)) != data.ndim or not {"Y", "X"} <= set(self.axes):
             raise BurstError(
                 f"a burst needs the axes T, Y, X and perhaps C; layer {self.names[0]!r} has shape "
                 f"{tuple(data.shape)} with axes {self.axes or 'unknown'}; open the frames as one stack, or correct "
@@ -105,7 +105,7 @@ class BurstSource:
         height, width = (
             (stop - start for start, stop in self.region) if self.region is not None else (sizes["Y"], sizes["X"])
         )
-        return sizes["T"], height, width, sizes.get("C", 1) if len(self.arrays) == 1 else len(self.arrays)
+        return sizes.get("T", 1), height, width, sizes.get("C", 1) if len(self.arrays) == 1 else len(self.arrays)
 
     @property
     def frames(self) -> Any:
@@ -143,32 +143,33 @@ class BurstSource:
             axes, data = axes + "C", np.stack(self.arrays, axis=-1)
         for axis in [axis for axis in axes if axis not in "TYXC"]:
             data, axes = data[(slice(None),) * axes.index(axis) + (0,)], axes.replace(axis, "")
-        return data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
+        ordered = data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
+        return ordered if "T" in axes else ordered[None]
 
 
 def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) -> BurstSource:
     """Describe the burst that lies in one layer, or in one layer for each channel."""
     first = layers[0]
-    told = first.metadata.get(METADATA_KEY, {}) if len(layers) == 1 else {}
-    truth = _truth(told, _data(first), axes)
+    metadata = first.metadata.get(METADATA_KEY, {}) if len(layers) == 1 else {}
+    truth = _truth(metadata, data_of(first), axes)
     pixel_size, unit = _pixel_size(first, axes)
     return BurstSource(
         names=tuple(layer.name for layer in layers),
-        arrays=tuple(_data(layer) for layer in layers),
+        arrays=tuple(data_of(layer) for layer in layers),
         axes=axes,
         region=region,
         pixel_size=pixel_size,
         unit=unit,
-        words=tuple(_words(layer) for layer in layers),
-        path=_path(first, told) if len(layers) == 1 else None,
-        recipe={} if truth is None else dict(told.get("recipe", {})),
+        words=tuple(words_of(layer) for layer in layers),
+        path=_path(first, metadata) if len(layers) == 1 else None,
+        recipe={} if truth is None else dict(metadata.get("recipe", {})),
         truth=truth,
     )
 
 
 def guess_axes(layer: Image) -> str:
     """Return the order of a layer's axes, a letter each, by its labels or else by its shape."""
-    data = _data(layer)
+    data = data_of(layer)
     labels = [_LABELS.get(label.lower(), "") for label in layer.axis_labels]
     if layer.rgb:
         return "TYXC"[-data.ndim :] if data.ndim <= 4 else "Q" * (data.ndim - 4) + "TYXC"
@@ -197,7 +198,7 @@ def region_of(shapes: Shapes, burst: Image, axes: str) -> Region:
     chosen = max(shapes.selected_data, default=len(shapes.data) - 1)
     corners = np.array([shapes.data_to_world(vertex)[-2:] for vertex in shapes.data[chosen]])
     inside = np.array([burst.world_to_data((*[0.0] * (burst.ndim - 2), *corner))[-2:] for corner in corners])
-    sizes = dict(zip(axes, _data(burst).shape, strict=True))
+    sizes = dict(zip(axes, data_of(burst).shape, strict=True))
     (y0, x0), (y1, x1) = np.rint(inside.min(axis=0)).astype(int), np.rint(inside.max(axis=0)).astype(int) + 1
     rows, columns = (max(y0, 0), min(y1, sizes["Y"])), (max(x0, 0), min(x1, sizes["X"]))
     if min(rows[1] - rows[0], columns[1] - columns[0]) < MIN_SIDE:
@@ -208,7 +209,7 @@ def region_of(shapes: Shapes, burst: Image, axes: str) -> Region:
     return (int(rows[0]), int(rows[1])), (int(columns[0]), int(columns[1]))
 
 
-def _data(layer: Image) -> Any:
+def data_of(layer: Image) -> Any:
     """Return a layer's array at full resolution, without the alpha channel of an RGBA picture."""
     data = layer.data[0] if layer.multiscale else layer.data
     return data[..., :3] if layer.rgb and data.shape[-1] == 4 else data
@@ -227,11 +228,11 @@ def _pixel_size(layer: Image, axes: str) -> tuple[tuple[float, float] | None, st
     return (float(abs(layer.scale[at[0]])), float(abs(layer.scale[at[1]]))), short
 
 
-def _truth(told: dict[str, Any], data: Any, axes: str) -> Truth | None:
+def _truth(metadata: dict[str, Any], data: Any, axes: str) -> Truth | None:
     """Return the truth that a layer carries, if its data are still those it is the truth of."""
-    if "truth" not in told or "homographies" not in told:
+    if "truth" not in metadata or "homographies" not in metadata:
         return None
-    frames, height, width, channels = told["truth"].shape
+    frames, height, width, channels = metadata["truth"].shape
     order = "TYXC" if len(axes) == 4 else "TYX"
     if (
         axes != order
@@ -239,16 +240,16 @@ def _truth(told: dict[str, Any], data: Any, axes: str) -> Truth | None:
         or (data.ndim == 3) != (channels == 1)
     ):
         return None
-    return Truth(picture=told["truth"][0], homographies=told["homographies"])
+    return Truth(picture=metadata["truth"][0], homographies=metadata["homographies"])
 
 
-def _path(layer: Image, told: dict[str, Any]) -> str | None:
+def _path(layer: Image, metadata: dict[str, Any]) -> str | None:
     """Return the file that reads as this layer; not one that holds other frames or channels too, or did once."""
-    path, shape = layer.source.path, _data(layer).shape
+    path, shape = layer.source.path, data_of(layer).shape
     if path is None:
         return None
-    if "shape" in told:  # by the reader of this plugin
-        return str(path) if tuple(told["shape"]) == shape else None
+    if "shape" in metadata:  # by the reader of this plugin
+        return str(path) if tuple(metadata["shape"]) == shape else None
     if not str(path).lower().endswith(TIFF_ENDINGS):
         return None
     try:
@@ -258,6 +259,7 @@ def _path(layer: Image, told: dict[str, Any]) -> str | None:
         return None
 
 
-def _words(layer: Image) -> str:
+def words_of(layer: Image) -> str:
+    """Return how the array of `data_of` is called in napari's console."""
     alpha = layer.rgb and (layer.data[0] if layer.multiscale else layer.data).shape[-1] == 4
     return f"viewer.layers[{layer.name!r}].data{'[0]' if layer.multiscale else ''}{'[..., :3]' if alpha else ''}"

@@ -4,11 +4,12 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 
 
 def as_python(
-    source: BurstSource, choices: Mapping[str, Any], calibration: str | None = None, *, before: str = ""
+    source: BurstSource, choices: Mapping[str, Any], bundle: BundleSource | None = None, *, before: str = ""
 ) -> str:
     """Return the lines of Python that do what the form is set to do.
 
@@ -18,16 +19,16 @@ def as_python(
         The burst; one that was not opened from a file is taken from the viewer, as napari's console knows it.
     choices : mapping
         What `napari_fiberburst.reconstruct` takes by name.
-    calibration : str, optional
-        Name of the layer with the calibration image.
+    bundle : BundleSource, optional
+        The bundle; one that was not opened from a file is a picture, and taken from the viewer.
     before : str
         The lines that made the result which this run continues.
     """
     plain = source.path is not None and source.region is None and _file_tells_axes(source)
     frames = f"{source.path!r}" if plain else _burst_call(source)
     lines = [frames, *(f"{name}={value!r}" for name, value in choices.items())]
-    if calibration is not None:
-        lines.append(f"calibration=viewer.layers[{calibration!r}].data")
+    if bundle is not None:
+        lines.append(f"calibration={bundle.words}" if bundle.path is None else f"bundle={bundle.path!r}")
     if before:
         lines.append("initial=result")
     imports = "reconstruct" if plain else "Burst, reconstruct"
@@ -36,10 +37,10 @@ def as_python(
     return f'{before}from napari_fiberburst import {imports}\n\n{call}result.save("picture.ome.tif")\n'
 
 
-def as_command(source: BurstSource, choices: Mapping[str, Any], calibration: str | None = None) -> str:
+def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSource | None = None) -> str:
     """Return the command line that does what the form is set to do.
 
-    A burst that is in no file comes first: as the command that simulates it, or as a remark on what to save.
+    What is in no file comes first: the command that simulates a burst, or a remark on what to save.
     """
     path = source.path
     lines = []
@@ -60,15 +61,17 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], calibration: str
         option = name.replace("_", "-")
         flag = [f"--{option}" if value else f"--no-{option}"]
         words += flag if isinstance(value, bool) else [f"--{option}", str(value)]
-    if calibration is not None:
-        lines.append(f"# save layer {calibration!r} as calibration.tif first")
+    if bundle is not None and bundle.path is not None:
+        words += ["--bundle", bundle.path]
+    elif bundle is not None:
+        lines.append(f"# save layer {bundle.name!r} as calibration.tif first")
         words += ["--calibration", "calibration.tif"]
     return "\n".join([*lines, shlex.join(words)]) + "\n"
 
 
 def _file_tells_axes(source: BurstSource) -> bool:
     """Whether a file with these layers is read with the right axes when nothing is said of them."""
-    return (source.axes in ("TYX", "TYXC") and len(source.names) == 1) or bool(source.recipe)
+    return (source.axes in ("TYX", "TYXC", "YX", "YXC") and len(source.names) == 1) or bool(source.recipe)
 
 
 def _burst_call(source: BurstSource) -> str:

@@ -1,4 +1,4 @@
-"""What `napari.yaml` names: sample data, a reader, a writer, and commands of the Layers menu.
+"""What `napari.yaml` names: sample data, readers, a writer, and commands of the Layers menu.
 
 Imported when napari starts to use one of them; loads neither torch nor, before it is needed, napari.
 """
@@ -20,6 +20,9 @@ LayerData = tuple[Any, dict[str, Any], str]
 _PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
+# Colours of cores in a bundle's layer, as `Bundle.picture` has them, and the quantile that is shown white.
+_CORE, _SATURATED, _DEAD = "#7bc86c", "#ff4d4d", "#3366ff"
+_BRIGHTEST = 0.99
 
 
 def make_sample(scene: str, physics: str) -> list[LayerData]:
@@ -35,7 +38,7 @@ def make_sample(scene: str, physics: str) -> list[LayerData]:
     simulated = simulate(scene, shape=_SAMPLE_SHAPE, frames=_SAMPLE_FRAMES, physics=physics)
     arrays = simulated.arrays()
     frames, is_grey = arrays["frames"], simulated.scene.channels == 1
-    told = {
+    metadata = {
         "recipe": {"scene": scene, "physics": physics},
         "truth": arrays["truth"],
         "homographies": arrays["homographies"],
@@ -45,7 +48,7 @@ def make_sample(scene: str, physics: str) -> list[LayerData]:
         "name": f"{scene} ({physics})",
         "rgb": not is_grey,
         "axis_labels": ("t", "y", "x"),
-        "metadata": {METADATA_KEY: told},
+        "metadata": {METADATA_KEY: metadata},
     }
     return [(frames[..., 0] if is_grey else frames, look, "image")]
 
@@ -64,12 +67,50 @@ cat_core = partial(make_sample, "cat", "core")
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
-    """Return a reader for a folder of frames or an npz burst, None for anything else."""
+    """Return a reader for a folder of frames, an npz burst or a bundle, None for anything else."""
     if not isinstance(path, str):
         return None
     place = Path(path)
+    if place.suffix.lower() == ".bundle":
+        return read_bundle
     is_burst = place.suffix.lower() == ".npz" or (place.is_dir() and _holds_frames(place))
     return read if is_burst else None
+
+
+def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
+    """Open a bundle as its transmission, with the bundle itself in the metadata, and its cores as points.
+
+    Points are as large as a core's footprint. Saturated cores are red, dead ones blue.
+
+    Raises
+    ------
+    BundleError
+        The file is no bundle, or is damaged.
+    """
+    from napari_fiberburst.bundle.bundle import Bundle
+
+    bundle, name = Bundle.load(str(path)), Path(str(path)).stem
+    bright = float(np.quantile(bundle.transmission[bundle.outline], _BRIGHTEST)) if bundle.outline.any() else 1.0
+    look = {
+        "name": name,
+        "axis_labels": ("y", "x"),
+        "contrast_limits": (0.0, max(bright, 1e-6)),
+        "metadata": {METADATA_KEY: {"bundle": bundle, "path": str(path)}},
+    }
+    layers: list[LayerData] = [(bundle.transmission, look, "image")]
+    if bundle.is_resolved:
+        states = np.append(np.where(bundle.saturated, "saturated", "core"), ["dead"] * len(bundle.dead))
+        colours = {"core": _CORE, "saturated": _SATURATED, "dead": _DEAD}
+        cores = {
+            "name": f"{name} cores",
+            "axis_labels": ("y", "x"),
+            "size": 2 * bundle.radius,
+            "features": {"state": states},
+            "face_color": "transparent",
+            "border_color": [colours[state] for state in states],
+        }
+        layers.append((np.concatenate([bundle.centres, bundle.dead])[:, ::-1], cores, "points"))
+    return layers
 
 
 def read(path: str | Sequence[str]) -> list[LayerData]:
@@ -103,8 +144,8 @@ def write(path: str, data: Any, attributes: dict[str, Any]) -> list[str]:
     OutputError
         The file cannot be written.
     """
-    told = attributes.get("metadata", {}).get(METADATA_KEY, {})
-    result = told.get("reconstruction")
+    metadata = attributes.get("metadata", {}).get(METADATA_KEY, {})
+    result = metadata.get("reconstruction")
     if result is not None:
         return [str(result.save(path))]
     from napari_fiberburst.io.results import write_whole

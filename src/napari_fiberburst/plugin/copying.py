@@ -37,11 +37,12 @@ class CopyButtons(QWidget):
             row.addWidget(button)
 
     def _copy(self, write: Callable[..., str]) -> None:
-        layer = self._source.calibration.layer
         try:
-            text = write(self._source.source(), self._form.choices(), None if layer is None else layer.name)
+            text = write(self._source.source(), self._form.choices(), self._source.bundle_source())
         except FiberBurstError as error:
             show_error(str(error))
             return
-        QApplication.clipboard().setText(text)
+        clipboard = QApplication.clipboard()
+        if clipboard is not None:
+            clipboard.setText(text)
         self.copied.emit("copied to the clipboard")

@@ -69,18 +69,18 @@ class Curves(QWidget):
         if len(points) == self._drawn:
             return
         self._drawn = len(points)
-        scored = [point for point in points if point.scores is not None]
+        scored = [(point.seconds, point.scores) for point in points if point.scores is not None]
         seconds = np.array([point.seconds for point in points])
         self._draw("loss", seconds, [point.loss for point in points])
         errors = [np.nan if point.sample_error is None else (2 * point.sample_error / span) ** 2 for point in points]
         self._draw("sample_error", seconds, errors)
         if scored:
-            at = np.array([point.seconds for point in scored])
+            at = np.array([moment for moment, _ in scored])
             self._truth.setVisible(True)
             self._motion.setVisible(True)
-            self._draw("psnr", at, [point.scores.psnr for point in scored])
-            self._draw("ssim", at, [10 * point.scores.ssim for point in scored])
-            self._draw("motion_error", at, [point.scores.motion_error for point in scored])
+            self._draw("psnr", at, [scores.psnr for _, scores in scored])
+            self._draw("ssim", at, [10 * scores.ssim for _, scores in scored])
+            self._draw("motion_error", at, [scores.motion_error for _, scores in scored])
 
     def follow_theme(self, event: Any = None) -> None:
         """Take the viewer's colours."""

@@ -12,7 +12,7 @@ from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidg
 from superqt import QLabeledSlider
 
 from napari_fiberburst.plugin.curves import Curves
-from napari_fiberburst.plugin.history import Moment
+from napari_fiberburst.plugin.history import Snapshot
 from napari_fiberburst.plugin.job import Job
 from napari_fiberburst.plugin.runs import KeptRun
 from napari_fiberburst.plugin.sections import section
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.results.progress import Progress
 
 # Per cent of an animation's own pace.
-_CALM, _USUAL = 4, 100
+_SLOW, _USUAL = 4, 100
 _NOTHING_YET = "Choose a burst and press Start."
 
 
@@ -69,7 +69,7 @@ class Display(QObject):
     def preview(self, run: KeptRun, job: Job, report: "Progress") -> None:
         """Show the picture that a running fit has come to, and keep it."""
         if report.preview is not None and job.acquisition is not None:
-            run.history.add(Moment(report.seconds, report.preview, report.canvas))
+            run.history.add(Snapshot(report.seconds, report.preview, report.canvas))
             run.layers.show_picture(report.preview, job.acquisition, report.canvas)
             if run is self._selected:
                 self.select(run)
@@ -114,7 +114,7 @@ class Display(QObject):
             before.layers.show_picture(result.image, result.acquisition, result.canvas)
         self._selected = run
         self.slider.blockSignals(True)
-        self.slider.setMaximum(0 if run is None else max(0, len(run.history.moments) - 1))
+        self.slider.setMaximum(0 if run is None else max(0, len(run.history.snapshots) - 1))
         self.slider.setValue(self.slider.maximum())
         self.slider.blockSignals(False)
 
@@ -160,12 +160,12 @@ class Display(QObject):
     def _scrub(self, index: int) -> None:
         """Show a picture of the past."""
         run = self._selected
-        if run is not None and run.result is not None and index < len(run.history.moments):
-            moment = run.history.moments[index]
-            run.layers.show_picture(moment.picture, run.result.acquisition, moment.canvas)
+        if run is not None and run.result is not None and index < len(run.history.snapshots):
+            snapshot = run.history.snapshots[index]
+            run.layers.show_picture(snapshot.picture, run.result.acquisition, snapshot.canvas)
 
 
-class Calm:
+class AnimationThrottle:
     """Slows the little animations of a window down while a fit is going.
 
     napari's sign of activity moves 30 times a second. Each time all of the window is drawn, which takes a graphics
@@ -177,9 +177,10 @@ class Calm:
 
     def slow(self, window: QWidget) -> None:
         """Slow down what moves in a window."""
-        self._slowed = [label.movie() for label in window.findChildren(QLabel) if label.movie() is not None]
+        movies = [label.movie() for label in window.findChildren(QLabel)]
+        self._slowed = [movie for movie in movies if movie is not None]
         for movie in self._slowed:
-            movie.setSpeed(_CALM)
+            movie.setSpeed(_SLOW)
 
     def restore(self) -> None:
         """Let it move as before. May be called more than once, and when the window is gone."""

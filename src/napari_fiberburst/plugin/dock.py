@@ -1,6 +1,7 @@
 """The dock widget "Fiber burst reconstruction"."""
 
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any
@@ -19,15 +20,16 @@ from superqt.utils import create_worker
 from napari_fiberburst.errors import FiberBurstError, SettingsError
 from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.budget import in_words, refuse_what_cannot_fit
+from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 from napari_fiberburst.plugin.calls import as_python
 from napari_fiberburst.plugin.copying import CopyButtons
-from napari_fiberburst.plugin.display import Calm, Display
+from napari_fiberburst.plugin.display import AnimationThrottle, Display
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
-from napari_fiberburst.plugin.layer_combo import LayerWatch
 from napari_fiberburst.plugin.layers import RunLayers
+from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered
 from napari_fiberburst.plugin.runner import Runner
@@ -61,8 +63,9 @@ class FiberBurstWidget(QWidget):
         self._shown_at_end = "picture"
         self._run: KeptRun | None = None
         self._missing: dict[str, str] | None = None
-        self._calm = Calm()
+        self._throttle = AnimationThrottle()
         self._is_network = False
+        self._wheel_filter = WheelFilter(self)
         self.input = InputBox(viewer)
         self.form = SettingsForm()
         self.runner = Runner(self)
@@ -92,40 +95,45 @@ class FiberBurstWidget(QWidget):
             show_error(str(error))
             return
         placement = self.input.placement(source)
-        self._begin(source, choices, placement, calibration=self.input.calibration.layer)
+        self._begin(source, choices, placement, bundle=self.input.bundle_source())
 
     def continue_run(self, run: KeptRun, steps: int) -> None:
         """Take a network's fit some steps further, as a run of its own."""
         if self.runner.state == "ready" and run.result is not None:
             choices = {"iterations": steps}
-            self._begin(run.source, choices, run.layers.placement, calibration=run.calibration, after=run)
+            self._begin(run.source, choices, run.layers.placement, bundle=run.bundle, after=run)
 
     def start_on(self, layer: "Layer", show: str = "picture") -> None:
         """Reconstruct a layer with the form as it is, and show the picture or the stabilised burst in the end."""
         if self.runner.state != "ready":
             show_error("a run is going; stop it, or wait for its end, before the next one")
-        elif not self.input.burst.choose(layer):
+        elif layer not in self.input.burst.choices:
             show_error(f"layer {layer.name!r} is no image that could be a burst; select the layer with the frames")
         else:
+            self.input.burst.value = layer
             self.start()
             self._shown_at_end = show
 
     def shut_down(self) -> None:
         """Stop what is running and let go of the viewer. May be called more than once."""
-        _let_go(self.runner, self.input.watch, self.display, self._calm)
+        _let_go(self.runner, self.display, self._throttle)
+
+    def reset_choices(self) -> None:
+        """Follow the viewer's layers; napari calls this when one is added, removed, moved or renamed."""
+        self.input.reset_choices()
 
     def sizeHint(self) -> QSize:
         """Ask for a narrow dock: the picture is what matters."""
         return QSize(_WIDTH, super().sizeHint().height())
 
-    def event(self, event: QEvent) -> bool:
+    def event(self, event: QEvent | None) -> bool:
         """Notice when the dock is closed for good: napari takes the widget out of it, and does not delete it."""
-        if event.type() == QEvent.Type.ParentChange:
+        if event is not None and event.type() == QEvent.Type.ParentChange:
             if self.parent() is None and self._was_docked:
                 self.shut_down()
                 self._follow_state("ready")
             elif self.parent() is not None:
-                self.input.watch.open()
+                self.reset_choices()
                 self.display.open()
             self._was_docked = self.parent() is not None
         return super().event(event)
@@ -136,27 +144,24 @@ class FiberBurstWidget(QWidget):
         choices: dict[str, Any],
         placement: Placement,
         *,
-        calibration: "Layer | None" = None,
+        bundle: BundleSource | None = None,
         after: KeptRun | None = None,
     ) -> None:
         name = self._new_name()
-        from_layer = None if calibration is None else calibration.name
-        python = as_python(source, choices, from_layer, before="" if after is None else after.python)
-        told = {"run": name, "burst": source.name, "choices": choices, "python": python}
+        python = as_python(source, choices, bundle, before="" if after is None else after.python)
+        metadata = {"run": name, "burst": source.name, "choices": choices, "python": python}
         initial = None if after is None else after.result
         settings = choose(**choices) if initial is None else initial.settings
         self._is_network = not isinstance(settings.method, SplineMethod)
         self._preferences = preferences()
-        layers = RunLayers(self._viewer, name, placement, told)
+        layers = RunLayers(self._viewer, name, placement, metadata)
         job = Job(
             source,
             {**choices, "preview_every": 1 / self._preferences.previews_per_second},
-            calibration=None if calibration is None else calibration.data,
+            bundle=None if bundle is None else bundle.given,
             initial=initial,
         )
-        self._run = KeptRun(
-            name=name, python=python, source=source, choices=choices, layers=layers, calibration=calibration
-        )
+        self._run = KeptRun(name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle)
         self._shown_at_end = "picture"
         self.display.begin()
         self.runs.add(self._run)
@@ -175,6 +180,8 @@ class FiberBurstWidget(QWidget):
     def _keep(self, job: Job) -> None:
         """Take over the result of a run."""
         if self._run is not None and job.result is not None:
+            if self._run.bundle is not None:
+                self._run.bundle = replace(self._run.bundle, bundle=job.bundle)
             self.form.show_chosen(job.result.settings)
             self.display.end(self._run, job)
             self.runs.refresh()
@@ -200,9 +207,9 @@ class FiberBurstWidget(QWidget):
         """Offer what can be done now."""
         is_ready = state == "ready"
         if is_ready:
-            self._calm.restore()
+            self._throttle.restore()
         else:
-            self._calm.slow(self.window())
+            self._throttle.slow(self.window() or self)
         self.start_button.setEnabled(is_ready)
         self.pause_button.setEnabled(state in ("running", "paused"))
         self.pause_button.setText("Continue" if state == "paused" else "Pause")
@@ -251,12 +258,15 @@ class FiberBurstWidget(QWidget):
     def _new_name(self) -> str:
         """Return the first name that no run of this viewer has."""
         taken = {layer.metadata.get(METADATA_KEY, {}).get("run") for layer in self._viewer.layers}
-        for dock in self.window().findChildren(FiberBurstWidget):  # a run may have no layer yet
+        for dock in (self.window() or self).findChildren(FiberBurstWidget):  # a run may have no layer yet
             taken |= {run.name for run in dock.runs.runs}
         return next(name for number in count(1) if (name := f"run {number}") not in taken)
 
     def _warm_up(self) -> None:
-        """Load torch in the background, which takes seconds, and learn which devices there are."""
+        """Load torch in the background, which takes seconds, and learn which devices there are.
+
+        The worker is superqt's, because napari shows its own as activity and asks before it closes.
+        """
         create_worker(load_solver, _connect={"returned": self._take_missing}, _ignore_errors=True)
 
     def _take_missing(self, missing: dict[str, str]) -> None:
@@ -280,6 +290,7 @@ class FiberBurstWidget(QWidget):
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
         column.addStretch(1)
+        self._wheel_filter.protect(content)
         scroll = QScrollArea()
         scroll.setWidgetResizable(True)
         scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
@@ -308,11 +319,10 @@ class FiberBurstWidget(QWidget):
         self.runner.state_changed.connect(self._follow_state)
         self.display.complete.connect(self._show_what_was_asked)
         # The window can go without a word to this widget; what is called then must not need it.
-        self.destroyed.connect(partial(_let_go, self.runner, self.input.watch, self.display, self._calm))
+        self.destroyed.connect(partial(_let_go, self.runner, self.display, self._throttle))
 
 
-def _let_go(runner: Runner, watch: LayerWatch, display: Display, calm: Calm) -> None:
-    calm.restore()
+def _let_go(runner: Runner, display: Display, throttle: AnimationThrottle) -> None:
+    throttle.restore()
     runner.shut_down()
-    watch.close()
     display.shut_down()

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from qtpy.QtCore import Qt, Signal
+from qtpy.QtGui import QStandardItemModel
 from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.errors import SettingsError
@@ -56,6 +57,25 @@ class SettingsForm(QWidget):
         self._lay_out()
         self._fill("auto", {})
         self._connect()
+
+    @property
+    def rows(self) -> Mapping[str, KnobRow]:
+        """The knobs' rows by name, also of those that do not apply."""
+        return self._rows
+
+    @property
+    def boxes(self) -> Mapping[str, QComboBox]:
+        """Where preset, motion, encoding and device are chosen."""
+        return {"preset": self._preset, "motion": self._motion, "encoding": self._encoding, "device": self._device}
+
+    @property
+    def shown(self) -> set[str]:
+        """Names of the knobs that apply: those whose rows can be seen."""
+        return {
+            name
+            for name, row in self._rows.items()
+            if any(layout.indexOf(row) >= 0 and layout.isRowVisible(row) for layout in (self._first, self._rest))
+        }
 
     @property
     def preset(self) -> str:
@@ -112,8 +132,11 @@ class SettingsForm(QWidget):
 
     def show_devices(self, missing: Mapping[str, str]) -> None:
         """Lock the devices that are not on this machine, and say why: {name: reason}."""
+        model = self._device.model()
+        assert isinstance(model, QStandardItemModel)  # a combo box's own
         for number, name in enumerate(_DEVICES):
-            item = self._device.model().item(number)
+            item = model.item(number)
+            assert item is not None
             item.setEnabled(name not in missing)
             item.setToolTip(missing.get(name, ""))
 
@@ -222,7 +245,8 @@ class SettingsForm(QWidget):
             box.blockSignals(False)
         for layout in (self._first, self._rest):
             for number in range(layout.rowCount()):
-                row = layout.itemAt(number, QFormLayout.ItemRole.FieldRole).widget()
+                item = layout.itemAt(number, QFormLayout.ItemRole.FieldRole)
+                row = None if item is None else item.widget()
                 if isinstance(row, KnobRow):
                     layout.setRowVisible(number, row.knob.name in settings.knobs)
         base = choose(self.preset, **{name: flat[name] for name in ("observation", "motion", "encoding")})

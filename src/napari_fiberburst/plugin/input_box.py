@@ -1,61 +1,80 @@
 """Which layers the burst is in, which axis is which, and what part of it to use."""
 
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
 from napari.components import ViewerModel
 from napari.layers import Image, Layer, Shapes
+from napari.utils.notifications import show_error
 from qtpy.QtCore import Qt, Signal
-from qtpy.QtWidgets import QLineEdit, QListWidget, QListWidgetItem, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QFileDialog, QLineEdit, QListWidget, QListWidgetItem, QPushButton, QVBoxLayout, QWidget
 
-from napari_fiberburst.errors import BurstError
-from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.errors import BurstError, FiberBurstError
+from napari_fiberburst.plugin.bundles import BundleSource, bundle_source, is_result, may_be_bundle, may_be_burst
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
-from napari_fiberburst.plugin.layer_combo import LayerCombo, LayerWatch
+from napari_fiberburst.plugin.contributions import read_bundle
+from napari_fiberburst.plugin.pickers import LayerPicker
 from napari_fiberburst.plugin.placement import Placement
-from napari_fiberburst.plugin.sections import form_layout, section
+from napari_fiberburst.plugin.sections import form_layout, row_of, section
 
 _LINES_OF_CHANNELS = 4
 
 
 class InputBox(QWidget):
-    """The burst's layer and the order of its axes; a calibration image, a region and further channels where wanted.
+    """The burst's layer and the order of its axes; its bundle, a region and further channels where wanted.
 
     Parameters
     ----------
     viewer : ViewerModel
         Whose layers.
+
+    Attributes
+    ----------
+    burst, bundle, region : LayerPicker
+        Their `value` is the layer chosen, or None.
+    axes : QLineEdit
+        Order of the burst's axes.
+    channels : QListWidget
+        Layers that may be further channels; those that are checked are.
     """
 
     changed = Signal()
 
     def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.burst = LayerCombo(viewer, _may_be_burst)
-        self.calibration = LayerCombo(viewer, _may_be_calibration, "none (not needed)")
-        self.region = LayerCombo(
-            viewer, lambda layer: isinstance(layer, Shapes) and not _is_result(layer), "whole frame"
+        self.burst = LayerPicker(viewer, may_be_burst)
+        self.bundle = LayerPicker(viewer, may_be_bundle, "none (not needed)")
+        self.region = LayerPicker(
+            viewer, lambda layer: isinstance(layer, Shapes) and not is_result(layer), "whole frame"
         )
+        self.open_button = QPushButton("Open…")
         self.axes = QLineEdit()
-        self._channels = QListWidget()
+        self.channels = QListWidget()
         self._listed: list[Image] = []
         self._viewer = viewer
         self._guessed_for: Layer | None = None
         self._lay_out()
-        self.watch = LayerWatch(viewer, self._refresh)
-        self.burst.layer_changed.connect(self._take_burst)
-        for combo in (self.calibration, self.region):
-            combo.layer_changed.connect(self.changed)
+        self.burst.changed.connect(self._take_burst)
+        for picker in (self.bundle, self.region):
+            picker.changed.connect(lambda _: self.changed.emit())
+        self.open_button.clicked.connect(self._ask_and_open)
         self.axes.textChanged.connect(self._take_axes)
-        self._channels.itemChanged.connect(lambda _: self.changed.emit())
+        self.channels.itemChanged.connect(lambda _: self.changed.emit())
         self._take_burst()
 
     @property
     def layers(self) -> list[Image]:
         """The burst's layers: the one chosen, and those that are further channels of it."""
-        if self.burst.layer is None:
+        if self.burst.value is None:
             return []
-        states = [self._channels.item(row).checkState() for row in range(self._channels.count())]
-        checked = Qt.CheckState.Checked
-        further = [layer for layer, state in zip(self._listed, states, strict=True) if state == checked]
-        return [self.burst.layer, *further]
+        items = [self.channels.item(row) for row in range(self.channels.count())]
+        further = [
+            layer
+            for layer, item in zip(self._listed, items, strict=True)
+            if item is not None and item.checkState() == Qt.CheckState.Checked
+        ]
+        return [self.burst.value, *further]
 
     def source(self) -> BurstSource:
         """Return the burst that is chosen.
@@ -63,8 +82,87 @@ class InputBox(QWidget):
         Raises
         ------
         FiberBurstError
-            None is, its axes are unknown, or the region is of no use.
+            None is, its axes are unknown, it is one frame and no bundle is chosen, or the region is of no use.
         """
+        whole = self._whole()
+        if "T" not in whole.axes and self.bundle.value is None:
+            raise BurstError(
+                f"a burst needs the axes T, Y, X and perhaps C, and layer {whole.name!r} has the axes {whole.axes}; "
+                "one frame is a burst only where its bundle is known: choose or open its bundle, or open the frames as "
+                "one stack"
+            )
+        layers, shapes = self.layers, self.region.value
+        return whole if shapes is None else source_of(layers, whole.axes, region_of(shapes, layers[0], whole.axes))
+
+    def bundle_source(self) -> BundleSource | None:
+        """Return the bundle that is chosen; None where none is."""
+        layer = self.bundle.value
+        return None if layer is None else bundle_source(layer)
+
+    def open_bundle(self, path: str | Path) -> None:
+        """Open a bundle as layers and choose it, or say why not."""
+        try:
+            opened = read_bundle(str(path))
+        except FiberBurstError as error:
+            show_error(str(error))
+            return
+        place = self._place_of_frames(opened[0][0].shape)
+        layers = [Layer.create(data, {**look, **place}, kind) for data, look, kind in opened]
+        for layer in layers:
+            self._viewer.add_layer(layer)
+        self.reset_choices()
+        self.bundle.value = layers[0]
+
+    def reset_choices(self) -> None:
+        """Follow the viewer's layers."""
+        for picker in (self.burst, self.bundle, self.region):
+            picker.reset_choices()
+        self._list_channels()
+
+    def placement(self, source: BurstSource) -> Placement:
+        """Return where the burst stands in the viewer."""
+        (row, _), (column, _) = source.region or ((0, 0), (0, 0))
+        return Placement.of(self.layers, source.axes, (row, column))
+
+    def set_enabled(self, is_enabled: bool) -> None:
+        """Lock or unlock what a running fit has taken."""
+        for picker in (self.burst, self.bundle, self.region):
+            picker.enabled = is_enabled
+        for widget in (self.axes, self.open_button, self.channels):
+            widget.setEnabled(is_enabled)
+
+    def _lay_out(self) -> None:
+        self.burst.tooltip = "The image layer with the burst's frames; 10 to 20 of them are a good burst."
+        self.axes.setToolTip(
+            "Order of the layer's axes, a letter each: T for the frames, Y, X, C for channels; others have length 1.\n"
+            "One frame, without T, is a burst where its bundle is chosen."
+        )
+        self.bundle.tooltip = (
+            "A bundle that was opened, or a picture of the bundle with nothing but even light before it. Never needed, "
+            "but with it one frame is a burst."
+        )
+        self.open_button.setToolTip("Open a bundle that was kept: a .bundle file.")
+        self.region.tooltip = "A layer of shapes, whose selected or last rectangle limits the run: for a quick look."
+        self.channels.setToolTip("Layers that are further channels of the same burst; same shape, one grey layer each.")
+        self.channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
+        first = form_layout()
+        first.addRow("burst", self.burst.native)
+        first.addRow("axes", self.axes)
+        bundle_row = row_of(self.bundle.native, self.open_button)
+        bundle_row.setStretch(0, 1)
+        first.addRow("bundle", bundle_row)
+        self._rest = rest = form_layout()
+        rest.addRow("region", self.region.native)
+        rest.addRow("channels", self.channels)
+        content = QWidget()
+        content.setLayout(rest)
+        whole = QVBoxLayout(self)
+        whole.setContentsMargins(0, 0, 0, 0)
+        whole.addLayout(first)
+        whole.addWidget(section("More input", content))
+
+    def _whole(self) -> BurstSource:
+        """Return the layers chosen, by the axes given, without a region."""
         layers = self.layers
         if not layers:
             raise BurstError(
@@ -77,51 +175,23 @@ class InputBox(QWidget):
             raise BurstError(f"the last axis of an RGB layer is its colours; got axes {axes}; let them end in C")
         whole = source_of(layers, axes)
         _ = whole.shape  # refuses axes that do not fit
-        shapes = self.region.layer
-        return whole if shapes is None else source_of(layers, axes, region_of(shapes, layers[0], axes))
+        return whole
 
-    def placement(self, source: BurstSource) -> Placement:
-        """Return where the burst stands in the viewer."""
-        (row, _), (column, _) = source.region or ((0, 0), (0, 0))
-        return Placement.of(self.layers, source.axes, (row, column))
+    def _place_of_frames(self, shape: tuple[int, int]) -> dict[str, Any]:
+        """Return where the burst's frames lie in the viewer; nothing where they have another size."""
+        with suppress(FiberBurstError):
+            whole = self._whole()
+            if whole.shape[1:3] == shape:
+                return Placement.of(self.layers, whole.axes, (0, 0)).on_canvas("YX")
+        return {}
 
-    def set_enabled(self, is_enabled: bool) -> None:
-        """Lock or unlock what a running fit has taken."""
-        for widget in (self.burst, self.axes, self.calibration, self.region, self._channels):
-            widget.setEnabled(is_enabled)
-
-    def _lay_out(self) -> None:
-        self.burst.setToolTip("The image layer with the burst's frames; 10 to 20 of them are a good burst.")
-        self.axes.setToolTip(
-            "Order of the layer's axes, a letter each: T for the frames, Y, X, C for channels; others have length 1."
-        )
-        self.calibration.setToolTip("A picture of the bundle with nothing but even light before it. Never needed.")
-        self.region.setToolTip("A layer of shapes, whose selected or last rectangle limits the run: for a quick look.")
-        self._channels.setToolTip(
-            "Layers that are further channels of the same burst; same shape, one grey layer each."
-        )
-        self._channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
-        first = form_layout()
-        first.addRow("burst", self.burst)
-        first.addRow("axes", self.axes)
-        self._rest = rest = form_layout()
-        rest.addRow("calibration", self.calibration)
-        rest.addRow("region", self.region)
-        rest.addRow("channels", self._channels)
-        content = QWidget()
-        content.setLayout(rest)
-        whole = QVBoxLayout(self)
-        whole.setContentsMargins(0, 0, 0, 0)
-        whole.addLayout(first)
-        whole.addWidget(section("More input", content))
-
-    def _refresh(self) -> None:
-        for combo in (self.burst, self.calibration, self.region):
-            combo.refresh()
-        self._list_channels()
+    def _ask_and_open(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, "Open bundle", "", "Bundle (*.bundle)")
+        if path:
+            self.open_bundle(path)
 
     def _take_burst(self) -> None:
-        layer = self.burst.layer
+        layer = self.burst.value
         if layer is not self._guessed_for:
             self._guessed_for = layer
             self.axes.setText("" if layer is None else guess_axes(layer))
@@ -134,38 +204,28 @@ class InputBox(QWidget):
 
     def _alike(self) -> list[Image]:
         """Return the layers that could be further channels of the burst chosen."""
-        burst = self.burst.layer
+        burst = self.burst.value
         if burst is None or burst.rgb or "C" in self.axes.text().upper():
             return []
         shape = burst.data.shape if not burst.multiscale else None
         return [
             layer
             for layer in self._viewer.layers
-            if layer is not burst and _may_be_burst(layer) and not layer.rgb and layer.data.shape == shape
+            if layer not in (burst, self.bundle.value)
+            and may_be_burst(layer)
+            and not layer.rgb
+            and layer.data.shape == shape
         ]
 
     def _list_channels(self) -> None:
         chosen = self.layers[1:]
-        self._channels.blockSignals(True)
-        self._channels.clear()
+        self.channels.blockSignals(True)
+        self.channels.clear()
         self._listed = self._alike()
         for layer in self._listed:
             item = QListWidgetItem(layer.name)
             item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
             item.setCheckState(Qt.CheckState.Checked if layer in chosen else Qt.CheckState.Unchecked)
-            self._channels.addItem(item)
-        self._channels.blockSignals(False)
-        self._rest.setRowVisible(self._channels, self._channels.count() > 0)
-
-
-def _may_be_burst(layer: Layer) -> bool:
-    """Whether a layer is an image and none of ours."""
-    return isinstance(layer, Image) and not _is_result(layer)
-
-
-def _may_be_calibration(layer: Layer) -> bool:
-    return _may_be_burst(layer) and not layer.multiscale
-
-
-def _is_result(layer: Layer) -> bool:
-    return "run" in layer.metadata.get(METADATA_KEY, {})
+            self.channels.addItem(item)
+        self.channels.blockSignals(False)
+        self._rest.setRowVisible(self.channels, self.channels.count() > 0)

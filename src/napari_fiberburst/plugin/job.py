@@ -16,6 +16,7 @@ from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.streaming import Latest
 
 if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.data.burst import Acquisition
     from napari_fiberburst.results.progress import Progress
     from napari_fiberburst.results.reconstruction import Reconstruction
@@ -76,8 +77,8 @@ class Job:
         The burst, still in its layers.
     choices : mapping
         What `napari_fiberburst.reconstruct` takes by name.
-    calibration : array, optional
-        Picture of the bundle in even light.
+    bundle : Bundle or array, optional
+        The bundle, or a picture of it in even light.
     initial : Reconstruction, optional
         To continue from.
 
@@ -87,6 +88,8 @@ class Job:
         To stop, pause and steer it.
     acquisition : Acquisition or None
         What is known of the burst, once it is read.
+    bundle : Bundle or None
+        The bundle that was given, once it is calibrated.
     reports, previews : Latest
         The newest `Progress`, and the newest one with a preview, for whoever looks.
     curve : list of CurvePoint
@@ -102,16 +105,17 @@ class Job:
         source: BurstSource,
         choices: Mapping[str, Any],
         *,
-        calibration: Any = None,
+        bundle: "Bundle | NDArray[Any] | None" = None,
         initial: "Reconstruction | None" = None,
     ) -> None:
         self._source: BurstSource | None = source
         self._choices = dict(choices)
-        self._calibration, self._initial = calibration, initial
+        self._given, self._initial = bundle, initial
         self._truth = _cropped(source)
         self._scored = self._scoring = 0.0
         self.control = Control()
         self.acquisition: Acquisition | None = None
+        self.bundle: Bundle | None = None
         self.reports: Latest[Progress] = Latest()
         self.previews: Latest[Progress] = Latest()
         self.curve: list[CurvePoint] = []
@@ -119,19 +123,21 @@ class Job:
         self.problem = ""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
-        """Make the call; raises nothing, for a worker's errors reach the window by more than one way."""
+        """Make the call. Raises nothing, because a worker's errors reach the window by more than one way."""
         # torch takes seconds to load, which the window must not wait for.
-        from napari_fiberburst.pipeline.reconstruct import reconstruct
+        from napari_fiberburst.pipeline.reconstruct import as_bundle, reconstruct
 
         assert self._source is not None
         try:
             burst = self._source.read()
             self.acquisition = burst.acquisition
             with without_clash():
+                if self._given is not None:
+                    self.bundle = as_bundle(self._given)
                 result = reconstruct(
                     burst,
                     **self._choices,
-                    calibration=self._calibration,
+                    bundle=self.bundle,
                     initial=self._initial,
                     control=self.control,
                     should_stop=should_stop,
@@ -150,7 +156,7 @@ class Job:
 
     def release(self) -> None:
         """Let go of all that is large. napari keeps every worker, and a worker its job, as long as the viewer."""
-        self._source = self._initial = self._calibration = self._truth = self.result = None
+        self._source = self._initial = self._given = self.bundle = self._truth = self.result = None
         self.reports, self.previews = Latest(), Latest()
         self.curve = []
 

@@ -1,16 +1,22 @@
-"""One row of a form for each knob, made from the knob itself: its kind, its range, its text."""
+"""One row of a form for each knob. magicgui makes the editor from the knob's kind, range and choices."""
 
+import sys
 from typing import Any
 
+from magicgui.backends._qtpy.widgets import QBaseRangedWidget
+from magicgui.widgets import create_widget
+from magicgui.widgets.bases import RangedWidget, ValueWidget
 from qtpy.QtCore import Signal
 from qtpy.QtGui import QValidator
-from qtpy.QtWidgets import QCheckBox, QComboBox, QDoubleSpinBox, QHBoxLayout, QLineEdit, QSpinBox, QWidget
+from qtpy.QtWidgets import QAbstractSpinBox, QCheckBox, QDoubleSpinBox, QHBoxLayout, QWidget
 
 from napari_fiberburst.settings.parameter import Knob
 
-_MOST_INTEGER = 2**31 - 1
-_LARGEST = 1e9
+# A bound for numbers that have none, and the least number that counts as above 0.
+_LARGEST_FLOAT, _LARGEST_INTEGER, _LEAST_ABOVE_ZERO = sys.float_info.max, 2**63 - 1, 1e-12
 _NARROWEST = 70
+# What an open knob shows before a run has chosen.
+_START = {"iterations": 1000, "time_budget": 60, "sigma": 5, "learning_rate": 1e-3, "batch": 8192, "smoothness": 0.01}
 
 
 class NumberBox(QDoubleSpinBox):
@@ -19,35 +25,52 @@ class NumberBox(QDoubleSpinBox):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.setDecimals(12)
-        self.setStepType(QDoubleSpinBox.StepType.AdaptiveDecimalStepType)
 
     def textFromValue(self, value: float) -> str:
-        """Return a number in the fewest digits that tell it."""
+        """Return a number in as few digits as it needs, at most six."""
         return f"{value:.6g}"
 
-    def valueFromText(self, text: str) -> float:
+    def valueFromText(self, text: str | None) -> float:
         """Read a number, with an exponent too."""
         try:
-            return float(text)
+            return float(text or "")
         except ValueError:
             return self.value()
 
-    def validate(self, text: str, position: int) -> tuple[QValidator.State, str, int]:
+    def validate(self, text: str | None, position: int) -> tuple[QValidator.State, str, int]:
         """Let anything be typed that may become a number in range."""
         try:
-            inside = self.minimum() <= float(text) <= self.maximum()
+            inside = self.minimum() <= float(text or "") <= self.maximum()
         except ValueError:
             inside = False
-        return (QValidator.State.Acceptable if inside else QValidator.State.Intermediate), text, position
+        return (QValidator.State.Acceptable if inside else QValidator.State.Intermediate), text or "", position
+
+
+class _NumberBackend(QBaseRangedWidget):
+    """What magicgui needs of a spin box, around ours: its own shows a fixed number of decimals and no exponents."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NumberBox, **options)
+
+
+class NumberEditor(RangedWidget[float]):
+    """magicgui's float spin box with numbers written as one would."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{**options, "widget_type": _NumberBackend})
 
 
 class KnobRow(QWidget):
-    """The widgets for one knob; where it may be left open, with a box "auto" that says what was chosen.
+    """The editor for one knob. Where the knob may be left open, a box "auto" says what was chosen.
 
     Attributes
     ----------
     knob : Knob
         What it stands for.
+    editor : magicgui.widgets.bases.ValueWidget
+        Shows and changes the value.
+    auto : QCheckBox or None
+        Checked where the knob is left open; None where it cannot be.
     """
 
     changed = Signal()
@@ -55,21 +78,19 @@ class KnobRow(QWidget):
     def __init__(self, knob: Knob, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.knob = knob
-        self._editor = _editor(knob)
-        self._auto = QCheckBox("auto") if knob.optional else None
+        self.editor = _editor(knob)
+        self.auto = QCheckBox("auto") if knob.optional else None
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
-        row.addWidget(self._editor, 1)
-        # A spin box asks for room for the longest number it could ever show.
-        self._editor.setMinimumWidth(_NARROWEST)
-        if self._auto is not None:
-            row.addWidget(self._auto)
-            self._auto.setToolTip(f"Leave {self.label} open.")
-            self._auto.toggled.connect(self._follow_auto)
-        for part in (self, self._editor):
+        row.addWidget(self.editor.native, 1)
+        if self.auto is not None:
+            row.addWidget(self.auto)
+            self.auto.setToolTip(f"Leave {self.label} open.")
+            self.auto.toggled.connect(self._follow_auto)
+        for part in (self, self.editor.native):
             part.setToolTip(f"{knob.doc}\n({knob.name}: {knob.expected})")
         self.set_value(knob.default)
-        _changed(self._editor).connect(lambda *_: self.changed.emit())
+        self.editor.changed.connect(lambda _: self.changed.emit())
 
     @property
     def label(self) -> str:
@@ -78,92 +99,72 @@ class KnobRow(QWidget):
 
     @property
     def value(self) -> Any:
-        """What the knob is turned to; None where it is left open."""
-        if self._auto is not None and self._auto.isChecked():
-            return None
-        editor = self._editor
-        if isinstance(editor, QCheckBox):
-            return editor.isChecked()
-        if isinstance(editor, QComboBox):
-            return editor.currentText()
-        return editor.text() if isinstance(editor, QLineEdit) else editor.value()
+        """The knob's value; None where it is left open."""
+        return None if self.auto is not None and self.auto.isChecked() else self.editor.value
 
     def set_value(self, value: Any) -> None:
         """Turn the knob, without a signal."""
-        blocked = [part for part in (self._editor, self._auto) if part is not None]
-        for part in blocked:
-            part.blockSignals(True)
-        if self._auto is not None:
-            self._auto.setChecked(value is None)
-            self._editor.setEnabled(value is not None)
-            self._auto.setText("auto")
+        if self.auto is not None:
+            self.auto.blockSignals(True)
+            self.auto.setChecked(value is None)
+            self.auto.setText("auto")
+            self.auto.blockSignals(False)
+            self.editor.enabled = value is not None
         if value is not None:
-            _set(self._editor, value)
-        for part in blocked:
-            part.blockSignals(False)
+            self._show(value)
 
     def allow_open(self, is_allowed: bool) -> None:
         """Offer to leave the knob open, or not where the preset has a value of its own."""
-        if self._auto is not None:
-            self._auto.setVisible(is_allowed)
+        if self.auto is not None:
+            self.auto.setVisible(is_allowed)
 
     def show_chosen(self, value: Any) -> None:
-        """Say what an open knob has come to in a run."""
-        if self._auto is None or not self._auto.isChecked():
+        """Say which value a run has chosen for an open knob."""
+        if self.auto is None or not self.auto.isChecked():
             return
         number = f"{value:.3g}" if isinstance(value, float) else f"{value}"
-        self._auto.setText("auto" if value is None else f"auto ({number})")
+        self.auto.setText("auto" if value is None else f"auto ({number})")
         if value is not None:
-            self._editor.blockSignals(True)
-            _set(self._editor, value)
-            self._editor.blockSignals(False)
+            self._show(value)
+
+    def _show(self, value: Any) -> None:
+        if isinstance(self.editor, RangedWidget):  # magicgui refuses what is out of range
+            value = min(max(value, self.editor.min), self.editor.max)
+        with self.editor.changed.blocked():
+            self.editor.value = value
 
     def _follow_auto(self, is_auto: bool) -> None:
-        self._editor.setEnabled(not is_auto)
-        self._auto.setText("auto")
+        self.editor.enabled = not is_auto
+        if self.auto is not None:
+            self.auto.setText("auto")
         self.changed.emit()
 
 
-def _editor(knob: Knob) -> QWidget:
+def _editor(knob: Knob) -> ValueWidget[Any]:
+    """Return an editor for the values that a knob allows, None left out: magicgui's ranged widgets know no None."""
     if knob.choices:
-        box = QComboBox()
-        box.addItems(knob.choices)
-        return box
-    if knob.kind is bool:
-        return QCheckBox()
-    if knob.kind is str:
-        return QLineEdit()
-    number = QSpinBox() if knob.kind is int else NumberBox()
-    least = knob.least if knob.least is not None else (1e-12 if knob.above == 0 else knob.above or -_LARGEST)
-    most = knob.most if knob.most is not None else _LARGEST
-    if knob.kind is int:
-        number.setStepType(QSpinBox.StepType.AdaptiveDecimalStepType)
-        least, most = int(least), int(min(most, _MOST_INTEGER))
-    number.setRange(least, most)
-    number.setKeyboardTracking(False)
-    if knob.default is None:
-        number.setValue(_START.get(knob.name, 1))
-    return number
-
-
-# What an open knob shows before a run has chosen.
-_START = {"iterations": 1000, "time_budget": 60, "sigma": 5, "learning_rate": 1e-3, "batch": 8192, "smoothness": 0.01}
-
-
-def _set(editor: QWidget, value: Any) -> None:
-    if isinstance(editor, QCheckBox):
-        editor.setChecked(value)
-    elif isinstance(editor, QComboBox):
-        editor.setCurrentText(value)
-    elif isinstance(editor, QLineEdit):
-        editor.setText(value)
+        editor = create_widget(widget_type="ComboBox", options={"choices": knob.choices})
+    elif knob.kind in (int, float):
+        start = _START.get(knob.name, 1) if knob.default is None else knob.default
+        editor = create_widget(
+            start,
+            widget_type=NumberEditor if knob.kind is float else "SpinBox",  # type: ignore[arg-type]
+            options=_range(knob),
+        )
     else:
-        editor.setValue(value)
+        editor = create_widget(annotation=knob.kind)
+    assert isinstance(editor, ValueWidget)
+    if isinstance(editor.native, QAbstractSpinBox):
+        editor.native.setKeyboardTracking(False)
+    # A spin box asks for room for the longest number that it could ever show.
+    editor.native.setMinimumWidth(_NARROWEST)
+    return editor
 
 
-def _changed(editor: QWidget) -> Any:
-    if isinstance(editor, QCheckBox):
-        return editor.toggled
-    if isinstance(editor, QComboBox):
-        return editor.currentTextChanged
-    return editor.editingFinished if isinstance(editor, QLineEdit) else editor.valueChanged
+def _range(knob: Knob) -> dict[str, float]:
+    """Return magicgui's inclusive bounds of a number."""
+    largest = _LARGEST_INTEGER if knob.kind is int else _LARGEST_FLOAT
+    least = knob.least if knob.least is not None else knob.above
+    if least == 0 and knob.above is not None:
+        least = _LEAST_ABOVE_ZERO
+    return {"min": -largest if least is None else least, "max": largest if knob.most is None else knob.most}

@@ -42,13 +42,13 @@ class RunLayers:
         The run's, in front of each layer's name.
     placement : Placement
         Where the burst is.
-    told : mapping
+    metadata : mapping
         What to write into each layer's metadata.
     """
 
-    def __init__(self, viewer: ViewerModel, name: str, placement: Placement, told: Mapping[str, Any]) -> None:
+    def __init__(self, viewer: ViewerModel, name: str, placement: Placement, metadata: Mapping[str, Any]) -> None:
         self._viewer, self._name, self.placement = viewer, name, placement
-        self._told = dict(told)
+        self._common = dict(metadata)
         self._layers: dict[str, Layer] = {}
         self._is_removed = False
         self._drawn_at: NDArray[np.float64] | None = None
@@ -59,6 +59,11 @@ class RunLayers:
     def pictures(self) -> list[Layer]:
         """The layers of the picture that are still in the viewer."""
         return [layer for kind, layer in self._layers.items() if _is_picture(kind) and self._has(layer)]
+
+    @property
+    def _has_time(self) -> bool:
+        """Whether the burst's layer has an axis of frames; the picture of one frame alone lies where the frame does."""
+        return "T" in self.placement.axes
 
     def show_picture(self, picture: NDArray[np.float32], acquisition: Acquisition, canvas: "Canvas") -> None:
         """Show a picture (H, W) or (H, W, C) in intensity units, in the layers that are there for it, or new ones."""
@@ -104,7 +109,7 @@ class RunLayers:
         None
             After each layer.
         """
-        self._told["homographies"] = result.homographies
+        self._common["homographies"] = result.homographies
         canvas, shape = result.canvas, result.acquisition.shape[1:3]
         self.show_picture(result.image, result.acquisition, canvas)
         for kind, layer in self._layers.items():
@@ -112,12 +117,13 @@ class RunLayers:
             layer.metadata = self._metadata({"reconstruction": result} if _is_picture(kind) else {})
         yield
         yield from self._put_frames(result.homographies, shape)
-        still = stabilised(frames, result.homographies, canvas)
-        if self.placement.rgb:
-            self._add("stabilised burst", still, "TYX", canvas, rgb=True)
-        else:
-            self._add("stabilised burst", still, "TYXC"[: still.ndim], canvas, colormap=self.placement.colormaps[0])
-        yield
+        if self._has_time:
+            still = stabilised(frames, result.homographies, canvas)
+            if self.placement.rgb:
+                self._add("stabilised burst", still, "TYX", canvas, rgb=True)
+            else:
+                self._add("stabilised burst", still, "TYXC"[: still.ndim], canvas, colormap=self.placement.colormaps[0])
+            yield
         self._add("coverage", result.coverage, "YX", canvas, colormap="viridis")
         yield
         self._add("uncertainty", result.uncertainty, "YX", canvas, colormap="magma")
@@ -134,7 +140,7 @@ class RunLayers:
 
     def tell(self, name: str, value: Any) -> None:
         """Write something more into the metadata of all layers of the run."""
-        self._told[name] = value
+        self._common[name] = value
         for layer in self._layers.values():
             layer.metadata = {METADATA_KEY: {**layer.metadata.get(METADATA_KEY, {}), name: value}}
 
@@ -204,8 +210,8 @@ class RunLayers:
         centre = corners.mean(axis=0, keepdims=True)
         known = [frame for frame, matrix in enumerate(homographies) if np.isfinite(matrix).all()]
         placed = self.placement.on_canvas(self.placement.axes)
-        self._told["homographies"] = homographies
-        if not known:
+        self._common["homographies"] = homographies
+        if not (known and self._has_time):
             return
         outlines = [one for frame in known for one in self._vertices(homographies[frame], corners, frame)]
         if _OUTLINES not in self._layers:
@@ -250,7 +256,7 @@ class RunLayers:
         layers.selection = chosen or {layer}
 
     def _metadata(self, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        return {METADATA_KEY: {**self._told, **(more or {})}}
+        return {METADATA_KEY: {**self._common, **(more or {})}}
 
     def _has(self, layer: Layer) -> bool:
         return layer in self._viewer.layers

@@ -83,6 +83,8 @@ class Placement:
         without copying anywhere else.
         """
         wanted = self.axes
+        if "T" in have and "T" not in wanted:  # of one frame, in a layer without time
+            array, have = array[(slice(None),) * have.index("T") + (0,)], have.replace("T", "")
         while wanted and wanted[0] not in have:
             wanted = wanted[1:]
         ordered = array.transpose([have.index(axis) for axis in wanted if axis in have])

@@ -42,8 +42,8 @@ def remembered(wanted: Preferences) -> dict[str, Any]:
     """Return the form's choices as they were left; where the preferences have changed since, those they name."""
     fresh = {"preset": wanted.preset} | ({} if wanted.device == "auto" else {"device": wanted.device})
     try:
-        told = json.loads(str(_store().value("form", "")))
-        return told["choices"] if told["preferences"] == asdict(wanted) else fresh
+        stored = json.loads(str(_store().value("form", "")))
+        return stored["choices"] if stored["preferences"] == asdict(wanted) else fresh
     except (ValueError, KeyError, TypeError):
         return fresh
 

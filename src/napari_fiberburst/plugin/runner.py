@@ -71,8 +71,9 @@ class Runner(QObject):
         if self._job is not None:
             raise RuntimeError("one run at a time: stop the one that is running first")
         self._job = job
-        # A plain function, for a generator's worker swallows RuntimeError, which is what torch raises.
-        self._worker = worker = create_worker(job.run, lambda: worker.abort_requested, _ignore_errors=True)
+        # A plain function, because a generator's worker swallows RuntimeError, which is what torch raises.
+        worker: FunctionWorker[None] = create_worker(job.run, lambda: bool(worker.abort_requested), _ignore_errors=True)
+        self._worker = worker
         worker.finished.connect(self._end)
         # Where there is no window for it, napari's bar would go to the terminal.
         self._progress = progress(total=1, desc=name, file=io.StringIO())
@@ -144,7 +145,9 @@ class Runner(QObject):
         bar = self._progress
         if bar is not None and bar.total != report.iterations:
             bar.total = report.iterations
-        if bar is not None and bar is self._progress:
+        if (
+            self._progress is bar and bar is not None
+        ):  # a change of its total lets events through, the end of the run among them
             bar.update(report.step - bar.n)
 
     def _end(self) -> None:

@@ -19,8 +19,9 @@ from qtpy.QtWidgets import (
     QWidget,
 )
 
-from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.errors import BundleError, FiberBurstError
 from napari_fiberburst.io.results import write_homographies
+from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 from napari_fiberburst.plugin.history import History
 from napari_fiberburst.plugin.job import Scores
@@ -29,8 +30,7 @@ from napari_fiberburst.plugin.sections import row_of
 from napari_fiberburst.settings import SplineMethod
 
 if TYPE_CHECKING:
-    from napari.layers import Layer
-
+    from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.results.reconstruction import Reconstruction
 
 _LINES_OF_RUNS = 4
@@ -47,8 +47,8 @@ class KeptRun:
         The user's to change.
     python : str
         The call, as lines of Python.
-    calibration : Layer or None
-        With the calibration image that it was given.
+    bundle : BundleSource or None
+        The bundle that it was given; calibrated, where it was a picture and the run has ended.
     source : BurstSource
         The burst.
     choices : dict
@@ -70,7 +70,7 @@ class KeptRun:
     source: BurstSource
     choices: Mapping[str, Any]
     layers: RunLayers
-    calibration: "Layer | None" = None
+    bundle: BundleSource | None = None
     history: History = field(default_factory=History)
     turned_live: list[tuple[float, str, Any]] = field(default_factory=list)
     result: "Reconstruction | None" = None
@@ -96,6 +96,24 @@ class KeptRun:
             )
         return "\n".join([*lines, *(f"Note: {note}" for note in result.notes)])
 
+    @property
+    def has_bundle(self) -> bool:
+        """Whether there is a bundle to keep."""
+        return self.result is not None and self.result.bundle is not None and self.result.bundle.is_resolved
+
+    def bundle_to_keep(self) -> "Bundle":
+        """Return the bundle that the run was given, improved by the run, or else the one that it has found.
+
+        Raises
+        ------
+        BundleError
+            There is none, or the run has measured nothing of it.
+        """
+        if self.result is None or self.result.bundle is None:
+            raise BundleError(f"{self.name} has found no bundle; run with the preset auto, and let it end")
+        given = None if self.bundle is None else self.bundle.bundle
+        return self.result.bundle if given is None else given.updated(self.result)
+
 
 class RunsPanel(QWidget):
     """The list of runs, and what can be done with them."""
@@ -108,23 +126,24 @@ class RunsPanel(QWidget):
         super().__init__(parent)
         self._runs: list[KeptRun] = []
         self._is_running = False
-        self._list = QListWidget()
-        self._list.setMaximumHeight(_LINES_OF_RUNS * self.fontMetrics().height() + 16)
-        self._list.setToolTip("The runs so far; double-click one to name it.")
+        self.list_of_runs = QListWidget()
+        self.list_of_runs.setMaximumHeight(_LINES_OF_RUNS * self.fontMetrics().height() + 16)
+        self.list_of_runs.setToolTip("The runs so far; double-click one to name it.")
         self._summary = QLabel()
         self._summary.setWordWrap(True)
         self._summary.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        self._other = QComboBox()
-        self._other.setToolTip("The run to compare with the one selected above.")
-        self._compare = QPushButton("A / B")
-        self._compare.setCheckable(True)
-        self._compare.setToolTip("Show the run selected above (A), or the one beside this button (B).")
-        self._save = QPushButton("Save result…")
-        self._save_motion = QPushButton("Save motion…")
-        self._save_motion.setToolTip("Save the homographies of the frames as CSV or JSON.")
-        self._remove = QPushButton("Remove")
-        self._remove.setToolTip("Forget this run and take its layers out of the viewer.")
-        self._continue = QPushButton("Continue for")
+        self.other = QComboBox()
+        self.other.setToolTip("The run to compare with the one selected above.")
+        self.compare_button = QPushButton("A / B")
+        self.compare_button.setCheckable(True)
+        self.compare_button.setToolTip("Show the run selected above (A), or the one beside this button (B).")
+        self.save_button = QPushButton("Save result…")
+        self.save_motion_button = QPushButton("Save motion…")
+        self.save_motion_button.setToolTip("Save the homographies of the frames as CSV or JSON.")
+        self.keep_button = QPushButton("Keep this bundle…")
+        self.remove_button = QPushButton("Remove")
+        self.remove_button.setToolTip("Forget this run and take its layers out of the viewer.")
+        self.continue_button = QPushButton("Continue for")
         self._more_steps = QSpinBox()
         self._lay_out()
         self._connect()
@@ -133,7 +152,7 @@ class RunsPanel(QWidget):
     @property
     def run(self) -> KeptRun | None:
         """The run that is selected."""
-        row = self._list.currentRow()
+        row = self.list_of_runs.currentRow()
         return self._runs[row] if 0 <= row < len(self._runs) else None
 
     @property
@@ -149,8 +168,8 @@ class RunsPanel(QWidget):
         self._runs.append(run)
         item = QListWidgetItem(run.name)
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsEditable)
-        self._list.addItem(item)
-        self._list.setCurrentItem(item)
+        self.list_of_runs.addItem(item)
+        self.list_of_runs.setCurrentItem(item)
         self._follow()
 
     def refresh(self) -> None:
@@ -159,22 +178,28 @@ class RunsPanel(QWidget):
 
     def save_result(self, run: KeptRun, path: str | Path) -> None:
         """Write a run's picture and its provenance, or say why not."""
-        if run.result is not None:
-            _try(lambda: run.result.save(path), path)
+        result = run.result
+        if result is not None:
+            _try(lambda: result.save(path), path)
 
     def save_homographies(self, run: KeptRun, path: str | Path) -> None:
         """Write a run's homographies as CSV or JSON, or say why not."""
-        if run.result is not None:
-            _try(lambda: write_homographies(path, run.result.homographies), path)
+        result = run.result
+        if result is not None:
+            _try(lambda: write_homographies(path, result.homographies), path)
+
+    def keep_bundle(self, run: KeptRun, path: str | Path) -> None:
+        """Write a run's bundle to a file, for other bursts through the same probe, or say why not."""
+        _try(lambda: run.bundle_to_keep().save(path), path)
 
     def remove(self, run: KeptRun) -> None:
         """Forget a run and take its layers away."""
-        self._compare.setChecked(False)
+        self.compare_button.setChecked(False)
         row = self._runs.index(run)
-        self._list.blockSignals(True)
+        self.list_of_runs.blockSignals(True)
         self._runs.remove(run)
-        self._list.takeItem(row)
-        self._list.blockSignals(False)
+        self.list_of_runs.takeItem(row)
+        self.list_of_runs.blockSignals(False)
         run.layers.remove()
         self._follow()
         self.removed.emit(run)
@@ -190,62 +215,71 @@ class RunsPanel(QWidget):
         self._more_steps.setValue(_MORE_STEPS)
         self._more_steps.setSuffix(" more steps")
         rows = [
-            (self._compare, self._other),
-            (self._continue, self._more_steps),
-            (self._save, self._save_motion, self._remove),
+            (self.compare_button, self.other),
+            (self.continue_button, self._more_steps),
+            (self.save_button, self.save_motion_button),
+            (self.keep_button, self.remove_button),
         ]
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self._list)
+        layout.addWidget(self.list_of_runs)
         layout.addWidget(self._summary)
         for widgets in rows:
             layout.addLayout(row_of(*widgets))
 
     def _connect(self) -> None:
-        self._list.currentRowChanged.connect(self._take_choice)
-        self._list.itemChanged.connect(self._rename)
-        self._compare.toggled.connect(self._show_a_or_b)
-        self._other.activated.connect(lambda _: self._show_a_or_b(self._compare.isChecked()))
-        self._save.clicked.connect(self._ask_and_save)
-        self._save_motion.clicked.connect(self._ask_and_save_motion)
-        self._remove.clicked.connect(lambda: self.remove(self.run) if self.run is not None else None)
-        self._continue.clicked.connect(lambda: self.continue_asked.emit(self.run, self._more_steps.value()))
+        self.list_of_runs.currentRowChanged.connect(self._take_choice)
+        self.list_of_runs.itemChanged.connect(self._rename)
+        self.compare_button.toggled.connect(self._show_a_or_b)
+        self.other.activated.connect(lambda _: self._show_a_or_b(self.compare_button.isChecked()))
+        self.save_button.clicked.connect(self._ask_and_save)
+        self.save_motion_button.clicked.connect(self._ask_and_save_motion)
+        self.keep_button.clicked.connect(self._ask_and_keep)
+        self.remove_button.clicked.connect(lambda: self.remove(self.run) if self.run is not None else None)
+        self.continue_button.clicked.connect(lambda: self.continue_asked.emit(self.run, self._more_steps.value()))
 
     def _follow(self) -> None:
         """Offer what makes sense for the run that is selected."""
         run = self.run
-        has_result = run is not None and run.result is not None
+        result = None if run is None else run.result
+        has_result = result is not None
         self._summary.setText("" if run is None else run.summary)
         self._summary.setVisible(has_result)
-        for button in (self._save, self._save_motion):
+        for button in (self.save_button, self.save_motion_button):
             button.setEnabled(has_result)
-        self._remove.setEnabled(has_result or (run is not None and not self._is_running))
+        self.remove_button.setEnabled(has_result or (run is not None and not self._is_running))
+        self.keep_button.setEnabled(run is not None and run.has_bundle)
+        self.keep_button.setToolTip(
+            "Save the bundle that the run was given, improved by what the run has measured."
+            if run is not None and run.bundle is not None
+            else "Save the bundle that the run has found, for other bursts through the same probe."
+        )
         others = [other for other in self._runs if other is not run]
-        self._other.blockSignals(True)
-        before = self._other.currentData()
-        self._other.clear()
+        self.other.blockSignals(True)
+        before = self.other.currentData()
+        self.other.clear()
         for other in others:
-            self._other.addItem(other.name, other)
+            self.other.addItem(other.name, other)
         if before in others:
-            self._other.setCurrentIndex(others.index(before))
-        self._other.blockSignals(False)
-        self._compare.setEnabled(bool(others))
-        is_network = has_result and not isinstance(run.result.settings.method, SplineMethod)
-        self._continue.setEnabled(is_network and not self._is_running)
+            self.other.setCurrentIndex(others.index(before))
+        self.other.blockSignals(False)
+        self.compare_button.setEnabled(bool(others))
+        is_network = result is not None and not isinstance(result.settings.method, SplineMethod)
+        self.continue_button.setEnabled(is_network and not self._is_running)
         self._more_steps.setEnabled(is_network and not self._is_running)
-        self._continue.setToolTip(
+        self.continue_button.setToolTip(
             "Go on from this result."
             if is_network or not has_result
             else "A spline is solved to its end, not trained: there is nothing to continue. Networks can go on."
         )
 
     def _take_choice(self) -> None:
-        self._compare.setChecked(False)
+        self.compare_button.setChecked(False)
         self._follow()
         self.chosen.emit(self.run)
 
     def _rename(self, item: QListWidgetItem) -> None:
-        run, name = self._runs[self._list.row(item)], item.text().strip()
+        run, name = self._runs[self.list_of_runs.row(item)], item.text().strip()
         if name and name != run.name:
             run.name = name
             run.layers.rename(name)
@@ -255,26 +289,39 @@ class RunsPanel(QWidget):
 
     def _show_a_or_b(self, is_b: bool) -> None:
         """Show the picture of one run, A or B, and hide those of all others."""
-        self._compare.setText("B / A" if is_b else "A / B")
-        shown = self._other.currentData() if is_b else self.run
+        self.compare_button.setText("B / A" if is_b else "A / B")
+        shown = self.other.currentData() if is_b else self.run
         for run in self._runs:
             run.layers.set_visible("picture", run is shown)
 
     def _ask_and_save(self) -> None:
         run = self.run
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save result", f"{run.name}.ome.tif", "OME-TIFF and JSON (*.ome.tif);;Representation (*.npz)"
-        )
-        if path:
-            self.save_result(run, path)
+        if run is not None:
+            path = self._ask(
+                "Save result", f"{run.name}.ome.tif", "OME-TIFF and JSON (*.ome.tif);;Representation (*.npz)"
+            )
+            if path:
+                self.save_result(run, path)
 
     def _ask_and_save_motion(self) -> None:
         run = self.run
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save homographies", f"{run.name} homographies.csv", "CSV (*.csv);;JSON (*.json)"
-        )
-        if path:
-            self.save_homographies(run, path)
+        if run is not None:
+            path = self._ask("Save homographies", f"{run.name} homographies.csv", "CSV (*.csv);;JSON (*.json)")
+            if path:
+                self.save_homographies(run, path)
+
+    def _ask_and_keep(self) -> None:
+        run = self.run
+        if run is not None:
+            given = None if run.bundle is None else run.bundle.path
+            path = self._ask("Keep bundle", given or f"{run.source.name}.bundle", "Bundle (*.bundle)")
+            if path:
+                self.keep_bundle(run, path)
+
+    def _ask(self, title: str, suggested: str, kinds: str) -> str:
+        """Return where the user wants a file; "" where nowhere."""
+        path, _ = QFileDialog.getSaveFileName(self, title, suggested, kinds)
+        return str(path)
 
 
 def _try(write: Callable[[], object], path: str | Path) -> None:

@@ -1,6 +1,8 @@
 """How the dock is laid out: sections that fold away, rows."""
 
-from qtpy.QtCore import QEvent, QObject, Qt
+from typing import Any
+
+from qtpy.QtCore import QEvent, Qt
 from qtpy.QtGui import QIcon, QPixmap
 from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QVBoxLayout, QWidget
 from superqt import QCollapsible
@@ -11,7 +13,7 @@ _ABOVE_CONTENT, _BELOW_CONTENT = 4, 10
 class _Section(QCollapsible):
     """Grows with what is in it, also where that changes while it is open."""
 
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+    def eventFilter(self, watched: Any, event: Any) -> bool:
         if event.type() == QEvent.Type.LayoutRequest and self.isExpanded():
             self.content().setMaximumHeight(self.content().sizeHint().height() + _BELOW_CONTENT)
         return bool(super().eventFilter(watched, event))
@@ -22,8 +24,10 @@ def section(title: str, content: QWidget) -> QCollapsible:
     # superqt draws its own arrows once, in the colours that were there before the viewer's theme.
     folded, unfolded = f"▸  {title}", f"▾  {title}"
     made = _Section(folded, expandedIcon=_no_icon(), collapsedIcon=_no_icon())
-    made.layout().setContentsMargins(0, 0, 0, 0)
-    made.layout().setSpacing(0)
+    around = made.layout()
+    if around is not None:
+        around.setContentsMargins(0, 0, 0, 0)
+        around.setSpacing(0)
     holder = QWidget()
     inside = QVBoxLayout(holder)
     inside.setContentsMargins(0, _ABOVE_CONTENT, 0, 0)
