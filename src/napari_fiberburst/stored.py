@@ -1,7 +1,12 @@
-"""Values of the method in files: arrays and JSON in the safetensors format, from which nothing can be executed."""
+"""Values of the method in files: arrays and JSON in the safetensors format, from which nothing can be executed.
+
+A file is read once, into one buffer, and the arrays are views of it: none is copied. They are not mapped from the disk,
+because a value must not change when its file does, and because the digest has to read every byte anyway.
+"""
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -11,13 +16,16 @@ from typing import Any, ClassVar, Self, get_args, get_origin, get_type_hints
 import numpy as np
 import safetensors.numpy
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
 
 from napari_fiberburst.errors import FiberBurstError, OutputError
 from napari_fiberburst.io.results import write_whole
 
 Arrays = dict[str, NDArray[Any]]
 _VERSION = 1
+# The names that the format has for the types of numbers that are stored.
+_DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BOOL": "|b1"}
+# A file begins with the length of its header, in so many bytes.
+_LENGTH = 8
 
 
 class Stored:
@@ -75,7 +83,7 @@ class Stored:
         try:
             value: Self = _built(cls, json.loads(document), "", arrays, device)
             value._check()
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
             raise cls._error(
                 f"{path} holds no complete {cls._kind} ({error}); expected a file that napari-fiberburst has written; "
                 "make it again"
@@ -88,25 +96,20 @@ class Stored:
     @classmethod
     def _read(cls, path: str | Path) -> tuple[Arrays, str]:
         """Return the arrays and the plain values of a file that is whole and as it was written."""
-        if not Path(path).is_file():
-            raise cls._error(f"there is no file {path}; expected a {cls._kind} that napari-fiberburst has written")
         try:
-            with safe_open(str(path), framework="numpy") as stored:
-                metadata = stored.metadata() or {}
-                arrays: Arrays = {name: stored.get_tensor(name) for name in stored.keys()}
-        except (SafetensorError, OSError) as error:
+            if not Path(path).is_file():
+                raise cls._error(f"there is no file {path}; expected a {cls._kind} that napari-fiberburst has written")
+            stored = _Safetensors(Path(path))
+            metadata = stored.metadata
+            cls._check_format(path, metadata)
+            arrays = stored.arrays()
+        except FiberBurstError:
+            raise
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
             raise cls._error(
                 f"{path} is no {cls._kind}, or is damaged ({error}); expected a file that napari-fiberburst has "
                 "written; make it again, or take another file"
             ) from error
-        expected = f"napari-fiberburst {cls._kind}"
-        if metadata.get("format") != expected:
-            raise cls._error(f"{path} is of format {metadata.get('format', 'unknown')!r}; expected {expected!r}")
-        if metadata.get("version") != str(_VERSION):
-            raise cls._error(
-                f"{path} is of version {metadata.get('version')}; expected version {_VERSION}; update "
-                f"napari-fiberburst, or make the {cls._kind} again"
-            )
         document = metadata.get("values", "")
         if metadata.get("digest") != _digest(arrays, document):
             raise cls._error(
@@ -114,6 +117,68 @@ class Stored:
                 "take another file"
             )
         return arrays, document
+
+    @classmethod
+    def _check_format(cls, path: str | Path, metadata: Mapping[str, str]) -> None:
+        expected = f"napari-fiberburst {cls._kind}"
+        if metadata.get("format") != expected:
+            raise cls._error(
+                f"{path} is of format {metadata.get('format', 'unknown')!r}; expected {expected!r}; take another file"
+            )
+        if metadata.get("version") != str(_VERSION):
+            raise cls._error(
+                f"{path} is of version {metadata.get('version')}; expected version {_VERSION}; update "
+                f"napari-fiberburst, or make the {cls._kind} again"
+            )
+
+
+class _Safetensors:
+    """A file in the safetensors format: its header at first, and its arrays once they are asked for.
+
+    The format's own library copies each array, and does not say where in the file it lies.
+
+    Raises
+    ------
+    OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError
+        The file is of another format, or is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with path.open("rb") as stream:
+            size = path.stat().st_size
+            length = int.from_bytes(stream.read(_LENGTH), "little")
+            if not 2 <= length <= size - _LENGTH:
+                raise ValueError(f"it has {size} bytes, and its header is said to have {length}")
+            header = json.loads(stream.read(length))
+        self.metadata: dict[str, str] = header.pop("__metadata__", {})
+        if not all(isinstance(value, str) for value in self.metadata.values()):
+            raise ValueError("its metadata must be text")
+        self._tensors, self._first, self._size = header, _LENGTH + length, size
+
+    def arrays(self) -> Arrays:
+        """Return the arrays, which are views of one buffer."""
+        buffer = bytearray(self._size)
+        with self._path.open("rb") as stream:
+            if stream.readinto(buffer) != self._size:
+                raise ValueError("it was cut short while it was read")
+        found: Arrays = {}
+        end = 0
+        for name, told in self._tensors.items():
+            dtype, shape = np.dtype(_DTYPES[told["dtype"]]), tuple(told["shape"])
+            start, stop = told["data_offsets"]
+            count = math.prod(shape)
+            if min(shape, default=0) < 0 or not 0 <= start <= stop or stop - start != count * dtype.itemsize:
+                raise ValueError(f"{name} of shape {shape} cannot lie in bytes {start} to {stop}")
+            found[name] = (
+                np.frombuffer(buffer, dtype, count, self._first + start).reshape(shape)
+                if count
+                else (np.empty(shape, dtype))
+            )
+            end = max(end, stop)
+        if self._first + end != self._size:
+            raise ValueError(f"its header tells of {self._first + end} bytes, and it has {self._size}")
+        return found
 
 
 def _flattened(value: Any, prefix: str, arrays: Arrays) -> dict[str, Any]:
@@ -166,5 +231,5 @@ def _digest(arrays: Arrays, document: str) -> str:
     digest = hashlib.sha256(document.encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape}".encode())
-        digest.update(arrays[name].tobytes())
+        digest.update(np.ascontiguousarray(arrays[name]).data)
     return digest.hexdigest()

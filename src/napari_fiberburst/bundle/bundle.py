@@ -1,9 +1,9 @@
 """What is known of a fibre bundle: measured once, kept in a file, used for every burst through the same probe."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,10 @@ from napari_fiberburst.stored import Stored
 _MOST_GAIN_WEIGHT = 1000.0
 # In pitches: two cores that are closer than this are the same one; and the share of cores that must be.
 _SAME_CORE, _LEAST_SAME = 0.3, 0.7
+
+Pattern = Literal["cores", "unresolved", "none"]
+# One picture or several, or the files that they are in.
+Pictures = ArrayLike | str | Path | Sequence[str | Path]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,8 +68,10 @@ class Bundle(Stored):
     outline : numpy.ndarray
         (H, W) bool, the field: where the bundle is.
     provenance : mapping
-        Where the bundle comes from, as plain values: "source" ("burst" or "image"), "bursts" (how many it has been
-        improved by), "file", "date", "version".
+        Where the bundle comes from, as plain values: "source" ("burst" or "image"), "frames" (how many), "files" and
+        "dark" (names of the pictures, where they came from files), "date", "version" (of this package), "bursts" (how
+        many it has been improved by), and "frame_from_bundle" in a reconstruction whose frames show the bundle
+        elsewhere than where it was calibrated.
 
     See Also
     --------
@@ -76,7 +82,7 @@ class Bundle(Stored):
     _ending: ClassVar[str] = ".bundle"
     _error: ClassVar[type[FiberBurstError]] = BundleError
 
-    pattern: Literal["cores", "unresolved", "none"]
+    pattern: Pattern
     pitch: float
     radius: float
     centres: NDArray[np.float64]
@@ -156,17 +162,15 @@ class Bundle(Stored):
         return bundle
 
     @classmethod
-    def from_image(
-        cls, image: ArrayLike | str | Path, *, dark: ArrayLike | str | Path | None = None, device: str = "auto"
-    ) -> "Bundle":
+    def from_image(cls, image: "Pictures", *, dark: "Pictures | None" = None, device: str = "auto") -> "Bundle":
         """Calibrate a bundle from a picture of it with nothing but even light before it.
 
         Parameters
         ----------
-        image : array_like or path
-            (H, W) or (H, W, C), intensities as the camera gives them; several, (T, H, W) or (T, H, W, C), are averaged.
-            Colour gives each core's gain in each channel.
-        dark : array_like or path, optional
+        image : array_like, path or sequence of paths
+            (H, W) or (H, W, C), intensities as the camera gives them; several, (T, H, W) or (T, H, W, C), are averaged,
+            which leaves less of the camera's noise in the gains. Colour gives each core's gain in each channel.
+        dark : array_like, path or sequence of paths, optional
             The same without light, or with all the light that does not come from the object: its darkest part is the
             black level, and what each core shows above it that core's offset. Without, the darkest part of `image`
             is the black level.
@@ -280,20 +284,19 @@ class Bundle(Stored):
         there = measured.bundle
         if there is None or measured.gain_ratios is None or measured.gain_weights is None:
             raise BundleError("the reconstruction has measured no gains; reconstruct a burst with this bundle")
-        frame_from_bundle = np.array(there.provenance.get("frame_from_bundle", np.eye(3)), dtype=np.float64)
-        here = transform_points(frame_from_bundle, self.centres)
-        distance, match = _nearest(there.centres, here)
-        inside = ((here >= 0) & (here <= np.array(there.shape[::-1]) - 1)).all(axis=1)
+        placed = self._placed_as(there)
+        distance, match = _nearest(there.centres, placed.centres)
+        inside = ((placed.centres >= 0) & (placed.centres <= np.array(there.shape[::-1]) - 1)).all(axis=1)
         same = distance < _SAME_CORE * self.pitch
         if not inside.any() or same[inside].mean() < _LEAST_SAME:
             share = same[inside].mean() if inside.any() else 0.0
             raise BundleError(
-                f"the reconstruction is of another bundle: {share:.0%} of the cores lie where this one has them; give "
-                "a result of reconstruct(..., bundle=...) with this bundle"
+                f"the reconstruction is of another bundle: {share:.0%} of the cores lie where this one has them "
+                f"(expected at least {_LEAST_SAME:.0%}); give a result of reconstruct(..., bundle=...) with this bundle"
             )
-        ratio = np.ones(len(here))
-        weight = np.zeros(len(here))
-        bright, brightness = self.brightness, there.brightness
+        ratio = np.ones(len(match))
+        weight = np.zeros(len(match))
+        bright, brightness = placed.brightness, there.brightness
         known = same & (bright > 0)
         ratio[known] = brightness[match[known]] * measured.gain_ratios[match[known]] / bright[known]
         weight[known] = measured.gain_weights[match[known]]
@@ -321,14 +324,33 @@ class Bundle(Stored):
         """
         height, width = acquisition.shape[1:3]
         if self.shape == (height, width):
-            return self
+            return self.with_frame_from_bundle(np.eye(3))
         row, column = acquisition.origin
         if row + height <= self.shape[0] and column + width <= self.shape[1] and (row, column) != (0, 0):
-            return self.crop((row, row + height), (column, column + width))
+            part = self.crop((row, row + height), (column, column + width))
+            return part.with_frame_from_bundle(np.array([[1.0, 0, -column], [0, 1, -row], [0, 0, 1]]))
         raise BundleError(
             f"the bundle was measured in frames of {self.shape[0]} x {self.shape[1]} pixels, and the burst has "
             f"{height} x {width}; calibrate with the camera set as for the burst, or crop both alike (Bundle.crop)"
         )
+
+    def with_frame_from_bundle(self, frame_from_bundle: NDArray[np.float64]) -> Self:
+        """Return the bundle with a note of the motion (3, 3) that has brought it to where it is, for `updated`."""
+        told = {name: value for name, value in self.provenance.items() if name != "frame_from_bundle"}
+        if not np.array_equal(frame_from_bundle, np.eye(3)):
+            told["frame_from_bundle"] = np.asarray(frame_from_bundle).tolist()
+        return self if told == self.provenance else replace(self, provenance=told)
+
+    def _placed_as(self, there: "Bundle") -> Self:
+        """Return this bundle in the frames of another one that was made from it by `fitted_to` and `moved`.
+
+        What interpolation does to the brightness of cores is the same in both, so it is not taken for gain.
+        """
+        if "frame_from_bundle" not in there.provenance:
+            return self
+        placed = self.moved(np.array(there.provenance["frame_from_bundle"], dtype=np.float64))
+        part = (slice(there.shape[0]), slice(there.shape[1]))
+        return replace(placed, transmission=placed.transmission[part], labels=placed.labels[part])
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the bundle as a picture, (H, W, 3): transmission in grey, saturated cores red, dead ones blue."""
@@ -344,26 +366,35 @@ class Bundle(Stored):
         return drawn
 
     def _check(self) -> None:
-        """Refuse arrays that do not belong together."""
+        """Refuse contents that do not belong together."""
         count, shape = len(self.centres), self.transmission.shape
-        expected = {
-            "centres": (count, 2),
-            "labels": shape,
-            "outline": shape,
-            "gain_weights": (count,),
-            "saturated": (count,),
-            "gains": (count, *self.gains.shape[1:]),
-            "offsets": (count, *self.offsets.shape[1:]),
+        expected: dict[str, tuple[str, tuple[int, ...]]] = {
+            "centres": ("float64", (count, 2)),
+            "labels": ("int32", shape),
+            "transmission": ("float32", (*shape[:1], *shape[1:2])),
+            "gains": ("float32", (count, *self.gains.shape[1:2])),
+            "gain_weights": ("float32", (count,)),
+            "offsets": ("float32", (count, *self.offsets.shape[1:2])),
+            "dead": ("float64", (len(self.dead), 2)),
+            "saturated": ("bool", (count,)),
+            "outline": ("bool", shape),
         }
-        for name, wanted in expected.items():
-            if getattr(self, name).shape != wanted:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {wanted}")
-        if self.labels.size and not (0 <= self.labels.min() and self.labels.max() <= count):
-            raise ValueError(f"labels must lie in 0 to {count}")
-        if not all(np.isfinite(getattr(self, name)).all() for name in ("centres", "transmission", "gains", "offsets")):
-            raise ValueError("its arrays hold NaN or infinity")
-        if not (self.pitch > 0 and self.radius > 0 and np.isfinite(self.black)):
-            raise ValueError("pitch and radius must be positive, and black finite")
+        for name, (dtype, wanted) in expected.items():
+            array = getattr(self, name)
+            if array.dtype != dtype or array.shape != wanted or (array.ndim == 2 and not array.shape[1]):
+                raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, expected {dtype} of {wanted}")
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise ValueError(f"{name} holds NaN or infinity")
+        if not count or not (0 <= self.labels.min() and self.labels.max() <= count):
+            raise ValueError(f"labels must lie in 0 to {count}, and there must be a core")
+        if not (self.gains > 0).all() or not (self.gain_weights >= 0).all():
+            raise ValueError("gains must be positive, and their weights not negative")
+        if self.pattern not in get_args(Pattern):
+            raise ValueError(f"pattern must be one of {', '.join(get_args(Pattern))}; got {self.pattern!r}")
+        if not (0 < self.pitch < np.inf and 0 < self.radius < np.inf and np.isfinite(self.black)):
+            raise ValueError("pitch and radius must be positive and finite, and black finite")
+        if not isinstance(self.provenance, Mapping):
+            raise TypeError("provenance must be a mapping")
 
 
 class GainMeasurement(Protocol):

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from napari_fiberburst import __version__
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
@@ -94,7 +95,7 @@ def calibrating_mean(
 
     In even light the picture is the transmission; otherwise its slow changes are divided out of it.
     """
-    told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d")}
+    told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": __version__}
     gain_weight = 1.0 if even_light else 0.0
     pitch = find_pitch(mean)
     yield "pitch found"

@@ -6,7 +6,7 @@ a rigid motion is fitted to what was found. How many cores are where they should
 tells this bundle from another one, and a change of zoom shows in the scale that the fit would take.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -31,6 +31,8 @@ _MARGIN_SHIFT, _MARGIN_ROTATION = 5.0, 1.0
 _ANGLE_STEP, _NEAR = 0.35, 0.25
 # Pitches: over this much the slow changes of the frames are divided out.
 _ENVELOPE = 3.0
+# Part of the light of the brightest place that a place has at least to show its cores.
+_LEAST_LIT = 0.05
 # Share of the cores in the frames that must be found in their places. Another bundle has 0.2, the area of the circle
 # in which a core counts as found; the same one has over 0.9, and in noise or behind a dark object somewhat less.
 _LEAST_FOUND = 0.6
@@ -39,8 +41,12 @@ _LEAST_FOUND = 0.6
 _LEAST_ALIKE = 0.25
 # A relative change of the distances between cores that is more than a re-plugged probe shows.
 _MOST_ZOOM = 0.01
+# The same, by how far neighbouring cores are apart: beyond it cores cannot be matched one by one.
+_MOST_SPACING = 0.04
 # Pixels below which the bundle is where it was.
 _LEAST_SHIFT = 0.1
+# Fewer cores than this in the frames do not tell one bundle from another.
+_LEAST_CORES = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +71,25 @@ class Placement:
     note: str = ""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What frames show of a bundle.
+
+    Attributes
+    ----------
+    picture : numpy.ndarray
+        (H, W), the mean of the frames with slow changes divided out.
+    lit : numpy.ndarray
+        (H, W) bool, where there is light enough to see cores.
+    cores : numpy.ndarray
+        (N, 2) as (x, y), their centres.
+    """
+
+    picture: NDArray[np.float32]
+    lit: NDArray[np.bool_]
+    cores: NDArray[np.float64]
+
+
 def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Placement:
     """Find where frames show a bundle.
 
@@ -82,38 +107,62 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     BundleError
         The frames show another bundle, or this one at another zoom, or too far away.
     """
-    if not bundle.is_resolved:
+    if not bundle.is_resolved or len(bundle.centres) < _LEAST_CORES:
         return Placement(bundle)
     mean = grey[exposed(grey)].mean(dim=0)
     black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
-    seen = _flattened((mean - black).clamp_min(0), bundle.pitch).cpu()
-    seen_cores = find_cores(seen, bundle.pitch, torch.ones_like(seen, dtype=torch.bool))
-    expected = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)
-    best, found = np.eye(3), (0.0, 0.0)
-    if len(seen_cores) >= 20:
-        best = _refined(np.eye(3), bundle, seen_cores)
-        found = _agreement(best, bundle, seen, seen_cores)
-    if not _is_it(found):
-        start = _searched(expected.numpy(), seen.numpy(), bundle.pitch)
-        best = _refined(start, bundle, seen_cores)
-        found = _agreement(best, bundle, seen, seen_cores)
-    zoom = _zoom(best, bundle, seen_cores)
-    if not _is_it(found):
+    flat, lit = (part.cpu() for part in _flattened((mean - black).clamp_min(0), bundle.pitch))
+    seen = Seen(picture=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
+    if len(seen.cores) < _LEAST_CORES:
         raise BundleError(
-            f"the frames show another bundle: {found[0]:.0%} of the cores are where this one has them (expected at "
-            f"least {_LEAST_FOUND:.0%}) and their brightness correlates by {found[1]:.2f} (expected {_LEAST_ALIKE}), "
-            f"even if it had moved by {MOST_SHIFT:g} px or {MOST_ROTATION:g} degrees; calibrate this bundle, or leave "
-            "it out"
+            f"the frames show {len(seen.cores)} cores, too few to tell where the bundle is (expected at least "
+            f"{_LEAST_CORES}); expose longer, or leave the bundle out"
         )
+    best = _refined(np.eye(3), bundle, seen)
+    found = _agreement(best, bundle, seen)
+    if not _is_it(found):
+        best = _refined(_searched(bundle, seen), bundle, seen)
+        found = _agreement(best, bundle, seen)
+    if not _is_it(found):
+        raise BundleError(_otherwise(bundle, seen, found))
+    zoom = _zoom(best, bundle, seen)
     if abs(zoom - 1) > _MOST_ZOOM:
         raise BundleError(
             f"the frames show this bundle at {zoom:.3f} times the size it was calibrated at; expected 1 to within "
             f"{_MOST_ZOOM:.0%}; calibrate it again at this zoom"
         )
-    return _placed(bundle, best, found)
+    return _placed(bundle, best)
 
 
-def _placed(bundle: Bundle, frame_from_bundle: NDArray[np.float64], found: tuple[float, float]) -> Placement:
+def _otherwise(bundle: Bundle, seen: Seen, found: tuple[float, float]) -> str:
+    """Return why the frames do not show the bundle."""
+    apart = _spacing(seen.cores) / _spacing(bundle.centres)
+    if abs(apart - 1) > _MOST_SPACING:
+        return (
+            f"the frames show another bundle, or this one at another zoom: cores are {apart:.2f} times as far apart as "
+            f"the {bundle.pitch:.2f} px of this one; expected 1 to within {_MOST_ZOOM:.0%}; calibrate with the optics "
+            "as for the burst, or leave the bundle out"
+        )
+    return (
+        f"the frames show another bundle: {found[0]:.0%} of the cores are where this one has them (expected at least "
+        f"{_LEAST_FOUND:.0%}) and their brightness correlates by {found[1]:.2f} (expected {_LEAST_ALIKE}), even if it "
+        f"had moved by {MOST_SHIFT:g} px or {MOST_ROTATION:g} degrees; calibrate this bundle, or leave it out"
+    )
+
+
+def _spacing(centres: NDArray[np.float64]) -> float:
+    """Return how far neighbouring cores are apart: the median distance to the nearest three."""
+    return float(np.median(np.asarray(cKDTree(centres).query(centres, k=4)[0])[:, 1:]))
+
+
+def _placed(bundle: Bundle, frame_from_bundle: NDArray[np.float64]) -> Placement:
+    """Return the bundle moved to where it was found.
+
+    Raises
+    ------
+    BundleError
+        That is too far away.
+    """
     height, width = bundle.shape
     middle = np.array([[(width - 1) / 2, (height - 1) / 2]])
     x, y = (transform_points(frame_from_bundle, middle) - middle)[0].tolist()
@@ -127,8 +176,8 @@ def _placed(bundle: Bundle, frame_from_bundle: NDArray[np.float64], found: tuple
     farthest = np.linalg.norm(transform_points(frame_from_bundle, corners) - corners, axis=1).max()
     if farthest < _LEAST_SHIFT:
         return Placement(bundle)
-    moved = bundle.moved(frame_from_bundle)
-    moved = replace(moved, provenance={**bundle.provenance, "frame_from_bundle": frame_from_bundle.tolist()})
+    before = np.array(bundle.provenance.get("frame_from_bundle", np.eye(3)), dtype=np.float64)
+    moved = bundle.moved(frame_from_bundle).with_frame_from_bundle(frame_from_bundle @ before)
     away = f"{np.hypot(x, y):.1f} px and {abs(rotation):.2f} degrees"
     note = f"the bundle was found {away} away from where it was calibrated"
     return Placement(moved, (x, y), rotation, note)
@@ -138,27 +187,28 @@ def _is_it(found: tuple[float, float]) -> bool:
     return found[0] >= _LEAST_FOUND and found[1] >= _LEAST_ALIKE
 
 
-def _flattened(picture: Tensor, pitch: float) -> Tensor:
-    """Return a picture (H, W) divided by itself blurred; 0 where there is no light."""
+def _flattened(picture: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
+    """Return a picture (H, W) divided by itself blurred, 0 where there is no light; and where there is light."""
     envelope = local_mean(picture, _ENVELOPE * pitch)
-    lit = envelope > 0.05 * envelope.max()
-    return torch.where(lit, picture / envelope.clamp_min(1e-6), torch.zeros_like(picture))
+    lit = envelope > _LEAST_LIT * envelope.max()
+    return torch.where(lit, picture / envelope.clamp_min(1e-6), torch.zeros_like(picture)), lit
 
 
-def _searched(expected: NDArray[np.float32], seen: NDArray[np.float32], pitch: float) -> NDArray[np.float64]:
+def _searched(bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
     """Return the rigid motion, of those searched, at which the pictures correlate best: (3, 3), frame from bundle."""
-    height, width = seen.shape
-    step = np.degrees(_ANGLE_STEP * pitch / (max(height, width) / 2))
+    expected = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
+    height, width = bundle.shape
+    step = np.degrees(_ANGLE_STEP * bundle.pitch / (max(height, width) / 2))
     most = MOST_ROTATION + _MARGIN_ROTATION
     angles = np.arange(-np.ceil(most / step), np.ceil(most / step) + 1) * step
     reach = int(np.ceil(MOST_SHIFT + _MARGIN_SHIFT))
-    spectrum = np.fft.rfft2(seen - seen.mean())
+    spectrum = np.fft.rfft2(seen.picture - seen.picture.mean())
     best, score = np.eye(3), -np.inf
     for angle in angles:
         motion = _rigid(np.radians(angle), (0.0, 0.0), (width, height))
         inverse = np.linalg.inv(motion)
         turned = affine_transform(expected, inverse[:2, :2][::-1, ::-1], inverse[:2, 2][::-1], order=1)
-        correlation = np.fft.irfft2(spectrum * np.fft.rfft2(turned - turned.mean()).conj(), s=seen.shape)
+        correlation = np.fft.irfft2(spectrum * np.fft.rfft2(turned - turned.mean()).conj(), s=bundle.shape)
         near = np.roll(correlation, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
         row, column = np.unravel_index(int(near.argmax()), near.shape)
         if near.max() > score:
@@ -181,22 +231,24 @@ def _rigid(angle: float, shift: tuple[float, float], size: tuple[int, int]) -> N
 
 
 def _matches(
-    motion: NDArray[np.float64], bundle: Bundle, seen_cores: NDArray[np.float64], reach: float
+    motion: NDArray[np.float64], bundle: Bundle, seen: Seen, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Return cores of the bundle and where the frames show them, (M, 2) each, and how many could have been shown."""
+    """Return cores of the bundle and where the frames show them, (M, 2) each, and how many could have been shown.
+
+    A core that looks at a dark part of the object cannot be shown.
+    """
     there = transform_points(motion, bundle.centres)
-    inside = ((there >= 1) & (there <= np.array(bundle.shape[::-1]) - 2)).all(axis=1)
-    distance, number = (np.asarray(part) for part in cKDTree(seen_cores).query(there))
-    near = inside & (distance < reach)
-    return bundle.centres[near], seen_cores[number[near]], int(inside.sum())
+    column, row = np.rint(there).astype(int).clip(0, np.array(bundle.shape[::-1]) - 1).T
+    could = ((there >= 1) & (there <= np.array(bundle.shape[::-1]) - 2)).all(axis=1) & seen.lit[row, column]
+    distance, number = (np.asarray(part) for part in cKDTree(seen.cores).query(there))
+    near = could & (distance < reach)
+    return bundle.centres[near], seen.cores[number[near]], int(could.sum())
 
 
-def _refined(motion: NDArray[np.float64], bundle: Bundle, seen_cores: NDArray[np.float64]) -> NDArray[np.float64]:
+def _refined(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
     """Return the rigid motion that brings the cores to where they are seen (Kabsch, 1976), by shrinking circles."""
-    if not len(seen_cores):
-        return motion
     for reach in (0.5, 0.4, 0.3, _NEAR, _NEAR):
-        here, there, _ = _matches(motion, bundle, seen_cores, reach * bundle.pitch)
+        here, there, _ = _matches(motion, bundle, seen, reach * bundle.pitch)
         if len(here) < 8:
             return motion
         first, second = here.mean(axis=0), there.mean(axis=0)
@@ -207,9 +259,9 @@ def _refined(motion: NDArray[np.float64], bundle: Bundle, seen_cores: NDArray[np
     return motion
 
 
-def _zoom(motion: NDArray[np.float64], bundle: Bundle, seen_cores: NDArray[np.float64]) -> float:
+def _zoom(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> float:
     """Return how much larger than calibrated the pattern of matched cores is."""
-    here, there, _ = _matches(motion, bundle, seen_cores, _NEAR * bundle.pitch)
+    here, there, _ = _matches(motion, bundle, seen, _NEAR * bundle.pitch)
     if len(here) < 8:
         return 1.0
     here, there = here - here.mean(axis=0), there - there.mean(axis=0)
@@ -217,16 +269,14 @@ def _zoom(motion: NDArray[np.float64], bundle: Bundle, seen_cores: NDArray[np.fl
     return float((turned * there).sum() / (turned**2).sum())
 
 
-def _agreement(
-    motion: NDArray[np.float64], bundle: Bundle, seen: Tensor, seen_cores: NDArray[np.float64]
-) -> tuple[float, float]:
+def _agreement(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> tuple[float, float]:
     """Return the share of cores found in their places, and the correlation of their brightness with the bundle's."""
-    here, there, count = _matches(motion, bundle, seen_cores, _NEAR * bundle.pitch)
+    here, there, count = _matches(motion, bundle, seen, _NEAR * bundle.pitch)
     if len(here) < 8:
         return 0.0, 0.0
-    flat = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch).numpy()
+    flat = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     known, shown = (
-        map_coordinates(picture, points.T[::-1], order=1) for picture, points in ((flat, here), (seen.numpy(), there))
+        map_coordinates(picture, points.T[::-1], order=1) for picture, points in ((flat, here), (seen.picture, there))
     )
     near = np.asarray(cKDTree(here).query(here, k=7)[1])
     known, shown = (values - values[near[:, 1:]].mean(axis=1) for values in (known, shown))

@@ -1,6 +1,7 @@
 """The transmission, measured once the frames are registered and the object is known."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -50,6 +51,4 @@ def with_gains(bundle: Bundle, per_core: Tensor, per_channel: Tensor | None = No
     """Return the bundle with gains (N,) of its cores taken into its transmission, and (N, C) into its channels."""
     factor = np.append(per_core.cpu().numpy(), np.float32(1)).astype(np.float32)[bundle.labels]
     gains = bundle.gains if per_channel is None else (bundle.gains * per_channel.cpu().numpy()).astype(np.float32)
-    from dataclasses import replace
-
     return replace(bundle, transmission=bundle.transmission * factor, gains=gains)

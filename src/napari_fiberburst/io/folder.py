@@ -46,7 +46,7 @@ def read_pictures(paths: list[Path], source: str) -> Recording:
 
 
 def read_picture(path: str | Path) -> NDArray[Any]:
-    """Read one picture, (H, W) or (H, W, C), from a PNG, TIFF or npy file.
+    """Read one picture, (H, W) or (H, W, C), from a PNG, TIFF or npy file; or the several of a stack, (T, H, W[, C]).
 
     Raises
     ------
@@ -54,11 +54,24 @@ def read_picture(path: str | Path) -> NDArray[Any]:
         It is not there, or no picture.
     """
     file = Path(path)
-    if file.suffix.lower() == ".npy" and file.is_file():
-        return np.asarray(np.load(file))
-    if file.suffix.lower() not in PICTURE_ENDINGS or not file.is_file():
-        raise BurstError(f"expected a picture ending in {', '.join((*PICTURE_ENDINGS, '.npy'))}; got {path}")
-    return _read_png(file) if file.suffix.lower() == ".png" else _read_page(file)
+    endings = (*PICTURE_ENDINGS, ".npy")
+    if file.suffix.lower() not in endings or not file.is_file():
+        raise BurstError(f"expected the file of a picture, ending in {', '.join(endings)}; got {path}")
+    try:
+        if file.suffix.lower() == ".npy":
+            return np.asarray(np.load(file, allow_pickle=False))
+        if file.suffix.lower() == ".png":
+            return _read_png(file)
+    except BurstError:
+        raise
+    except (OSError, ValueError, EOFError) as error:
+        raise BurstError(f"{path} cannot be read as a picture ({error}); export it again") from error
+    recording = read_tiff(file)
+    axes = (recording.axes or "").replace("S", "C")
+    order = [axes.index(axis) for axis in "TYXC" if axis in axes]
+    if len(order) != len(axes) or not {"Y", "X"} <= set(axes):
+        raise BurstError(f"{path} must hold a picture or a stack of them; got axes {axes}; save it with axes TYXC")
+    return np.transpose(recording.pixels, order)
 
 
 def _read_page(path: Path) -> NDArray[Any]:

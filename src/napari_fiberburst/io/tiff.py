@@ -39,10 +39,7 @@ def read_tiff(path: Path) -> Recording:
     except BurstError:
         raise
     except Exception as error:  # tifffile and its codecs fail on damaged files in many ways
-        advice = "copy or export it again"
-        if "imagecodecs" in str(error):
-            advice = "install it by: pip install imagecodecs, or save the file without compression"
-        raise BurstError(f"{path} cannot be read as TIFF ({error}); {advice}") from error
+        raise BurstError(f"{path} cannot be read as TIFF ({error}); copy or export it again") from error
 
 
 def _is_cut_short(file: tifffile.TiffFile) -> bool:
