@@ -75,7 +75,9 @@ def publish(folder: Path, target: Path, numbers: Sequence[int], *, overwrite: bo
     for number in found:
         table = NUMBERED[number]
         kept = [] if overwrite else published.rows(table)
-        merged = {key(row): row for row in (*kept, *measured.rows(table))}
+        # A peer that is not installed here must not cost the figures that were published of it.
+        merged = {key(row): row for row in kept}
+        merged |= {key(row): row for row in measured.rows(table) if "missing" not in row or key(row) not in merged}
         write_rows(published.rows_file(table), merged.values())
     if found:
         write_json(target / "about.json", with_earlier(about, before if keeps_rows else {}))

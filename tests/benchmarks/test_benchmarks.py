@@ -313,6 +313,20 @@ def test_rows_of_two_kinds_of_run_are_not_published_together(measured, tmp_path,
     assert [row["method"] for row in Results(target).rows(SCENES)] == ["captured"]
 
 
+def test_a_peer_that_is_missing_here_keeps_its_published_row(tmp_path):
+    target = tmp_path / "docs" / "results"
+    for name, found in (("with", {"psnr": 20.0, "ssim": 0.5}), ("without", {})):
+        with Recorder(tmp_path / name, "quick") as recorder:
+            for method in ("pyfibrebundle", "pyfibrebundle-sr"):
+                is_missing = not found or method == "pyfibrebundle-sr"
+                row = {"burst": vars_of(SMALL)} | ({"missing": "not installed"} if is_missing else found)
+                recorder.row(CONDITIONS, "as it is", method, lambda row=row: row)
+        publish.publish(tmp_path / name, target, [3])
+    published = {row["method"]: row for row in Results(target).rows(CONDITIONS)}
+    assert published["pyfibrebundle"]["psnr"] == 20
+    assert published["pyfibrebundle-sr"]["missing"] == "not installed"
+
+
 def test_nothing_measured_is_nothing_to_publish(tmp_path):
     with pytest.raises(OutputError, match=r"has no rows of tables \[1, 3\]; measure them"):
         publish.publish(tmp_path / "empty", tmp_path / "docs" / "results", [1, 3])
