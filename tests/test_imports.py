@@ -13,12 +13,12 @@ def modules_after(statement: str) -> set[str]:
 
 def test_importing_the_package_loads_neither_torch_nor_qt_nor_napari():
     loaded = modules_after("import napari_fiberburst")
-    assert not loaded & {"torch", "qtpy", "PyQt6", "PySide6", "napari", "numpy", "skimage"}
+    assert not loaded & {"torch", "qtpy", "PyQt6", "PySide6", "napari", "numpy", "skimage", "pydantic"}
 
 
 def test_opening_a_burst_needs_no_torch():
     loaded = modules_after("from napari_fiberburst import Burst, Settings, Control, Reconstruction, read_burst")
-    assert not loaded & {"torch", "qtpy", "napari"}
+    assert not loaded & {"torch", "qtpy", "napari", "pydantic"}
 
 
 def test_every_public_name_is_there():

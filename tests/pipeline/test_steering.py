@@ -30,12 +30,8 @@ def test_stopping_before_the_first_step_gives_the_start(fit, tiny_burst):
     assert len(result.losses) == 0
     assert np.isfinite(result.image).all()
     np.testing.assert_array_equal(result.homographies[0], np.eye(3))
-    start = (
-        JointField(result.settings.method, tiny_burst.shape, seed=result.settings.seed)
-        .motion.scene_from_frame()
-        .detach()
-        .numpy()
-    )
+    field = JointField(result.settings.method, tiny_burst.shape, seed=result.settings.seed)
+    start = field.motion.scene_from_frame().detach().numpy()
     expected = relative_to(in_pixels(start.astype(np.float64), (31, 37)), 0)
     np.testing.assert_allclose(result.homographies, expected, atol=1e-6)
 

@@ -13,6 +13,8 @@ from napari_fiberburst.settings import (
     METHODS,
     MOTIONS,
     PUBLISHED_MOTIONS,
+    Affine,
+    Flow,
     FlowTV,
     Fourier,
     Hash,
@@ -22,6 +24,9 @@ from napari_fiberburst.settings import (
     NetworkMethod,
     PublishedMethod,
     Settings,
+    Siren,
+    SplineMethod,
+    all_keywords,
     choose,
 )
 from napari_fiberburst.settings.parameter import knobs_of
@@ -87,6 +92,10 @@ def test_a_settings_object_stands_for_a_name():
         ({"preset": "paper", "motion": "affine"}, "known: none, homography, flow, flow_tv"),
         ({"preset": "paper", "encoding": "spline"}, "needs a bundle model"),
         ({"preset": "paper", "canvas": "union"}, "canvas must be frame"),
+        ({"batch": 64}, "batch belongs to networks and does not apply to motion 'homography' with encoding 'spline'"),
+        ({"encoding": "hash", "smoothness": 1.0}, "belongs to encoding 'spline' and does not apply"),
+        ({"preset": "paper", "fill": True}, "belongs to a bundle model and does not apply to the published method"),
+        ({"samples": "cores"}, "is no setting"),
         ({"fill": 1}, "true or false"),
         ({"held_out": 0.7}, "of at most 0.5"),
     ],
@@ -132,6 +141,153 @@ def test_the_observation_decides_what_a_homography_is():
     assert choose(observation="frames").method.motion == HomographyNetwork()
     assert choose("paper", observation="auto").method.motion == Homography()
     assert choose("paper", observation="cores").method.encoding == Fourier(sigma=5.0)
+
+
+def test_the_keywords_choose_the_method():
+    assert choose().method == SplineMethod()
+    assert choose(encoding="siren", observation="pixels").method == NetworkMethod(encoding=Siren(), samples="pixels")
+    assert choose(observation="frames").method == choose("paper").method == PublishedMethod()
+    assert choose(encoding="hash", observation="frames").method == PublishedMethod(encoding=Hash())
+    assert choose("paper", observation="cores", encoding="spline").method == SplineMethod(
+        samples="cores", iterations=3000
+    )
+
+
+def test_values_that_another_method_has_too_are_carried_over():
+    start = choose(motion="affine", upsample=2.0, canvas="union", smoothness=0.5, iterations=7)
+    assert choose(start, encoding="nerf").method == NetworkMethod(
+        motion=Affine(), encoding=NeRF(), upsample=2.0, canvas="union", iterations=7
+    )
+    assert choose(start, observation="frames").method == PublishedMethod(upsample=2.0, iterations=7)
+
+
+def test_a_method_refuses_parts_of_another():
+    with pytest.raises(SettingsError, match="motion must be one of NoMotion, HomographyNetwork, Flow, FlowTV"):
+        PublishedMethod(motion=Homography())
+    with pytest.raises(SettingsError, match="encoding must be one of NoEncoding"):
+        NetworkMethod(encoding="spline")
+    with pytest.raises(SettingsError, match="method must be one of SplineMethod, NetworkMethod, PublishedMethod"):
+        Settings(method="spline")
+    with pytest.raises(SettingsError, match="motion flow needs a network encoding"):
+        SplineMethod(motion=Flow())
+
+
+ALL_KINDS = [
+    {"motion": "affine", "observation": "cores", "smoothness": 0.25, "fill": True, "time_budget": 3.0},
+    {"encoding": "fourier", "motion": "flow_tv", "tv_weight": 0.5, "canvas": "union", "batch": 64, "seed": 5},
+    {"preset": "paper", "encoding": "hash", "levels": 5, "learning_rate": 0.01, "device": "cpu"},
+]
+
+
+@pytest.mark.parametrize("choices", ALL_KINDS)
+def test_the_flat_keywords_give_the_settings_back(choices):
+    settings = choose(**choices)
+    assert choose(**settings.flat()) == settings
+    assert set(settings.flat()) == {"motion", "encoding", *settings.knobs}
+    for name, value in choices.items():
+        if name in settings.knobs:
+            assert settings.value_of(name) == value
+    with pytest.raises(SettingsError, match="is no setting"):
+        settings.value_of("sgima")
+
+
+def test_json_is_nested_and_tells_the_method_by_name():
+    told = choose(encoding="hash", motion="flow", levels=5, seed=3).to_dict()
+    assert (told["seed"], told["method"]["name"], told["method"]["samples"]) == (3, "network", "auto")
+    assert told["method"]["motion"]["name"] == "flow"
+    assert told["method"]["encoding"]["levels"] == 5
+    assert "smoothness" not in told["method"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"method": None}, "method must be a mapping of names to values; got None"),
+        ({"method": {"name": "wavelets"}}, "unknown method 'wavelets'; known: spline, network, published"),
+        ({"method": {}}, "unknown method None"),
+        ({"method": {"name": "published", "motion": {"name": "affine"}}}, "known: none, homography, flow, flow_tv"),
+        ({"method": {"name": "network", "encoding": "nerf"}}, "encoding must be a mapping"),
+        ({"method": {"name": "spline", "batch": 3}}, "batch is no setting of SplineMethod; known: .*smoothness"),
+        ({"method": {"name": "spline", "iterations": "3"}}, "iterations must be an integer of at least 1, or None"),
+        ({"speed": 3}, "speed is no setting of Settings; known: method, seed"),
+        ({"seed": 1.5}, "seed must be an integer"),
+    ],
+)
+def test_json_that_is_no_settings_is_refused(change, said):
+    with pytest.raises(SettingsError, match=said):
+        Settings.from_dict({**Settings().to_dict(), **change})
+
+
+def test_settings_that_are_no_mapping_are_refused():
+    with pytest.raises(SettingsError, match="settings must be a mapping of names to values; got 'auto'"):
+        Settings.from_dict("auto")
+
+
+# As version 0.1.0 wrote them: on one level, those of other methods among them.
+FLAT = {"canvas": "frame", "upsample": 2.0, "fill": True, "held_out": 0.1, "scene_layers": 3, "scene_width": 64}
+FLAT |= {"iterations": None, "learning_rate": None, "batch": 99, "seed": 4, "device": "cpu"}
+FLAT |= {"time_budget": None, "preview_every": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("parts", "method"),
+    [
+        (
+            {"motion": {"name": "affine"}, "encoding": {"name": "spline", "smoothness": 0.5}, "observation": "cores"},
+            SplineMethod(motion=Affine(), smoothness=0.5, samples="cores", upsample=2.0, fill=True, held_out=0.1),
+        ),
+        (
+            {
+                "motion": {"name": "flow", "motion_layers": 2, "motion_width": 8, "flow_omega_0": 3.0},
+                "encoding": {"name": "fourier", "features": 8, "sigma": 1.5},
+                "observation": "auto",
+            },
+            NetworkMethod(
+                motion=Flow(motion_layers=2, motion_width=8, flow_omega_0=3.0),
+                encoding=Fourier(features=8, sigma=1.5),
+                upsample=2.0,
+                fill=True,
+                held_out=0.1,
+                scene_layers=3,
+                scene_width=64,
+                batch=99,
+            ),
+        ),
+        (
+            {
+                "motion": {"name": "homography", "motion_layers": 2, "motion_width": 8},
+                "encoding": {"name": "nerf", "highest_octave": 4},
+                "observation": "frames",
+            },
+            PublishedMethod(
+                motion=HomographyNetwork(motion_layers=2, motion_width=8),
+                encoding=NeRF(highest_octave=4),
+                upsample=2.0,
+                scene_layers=3,
+                scene_width=64,
+                batch=99,
+            ),
+        ),
+    ],
+)
+def test_settings_of_the_first_version_are_still_read(parts, method):
+    settings = Settings.from_dict({**FLAT, **parts})
+    assert settings == Settings(method=method, seed=4, device="cpu", preview_every=2.0)
+
+
+def test_what_is_left_open_is_named():
+    assert choose().left_open == ("observation", "smoothness", "iterations", "device")
+    network = choose(encoding="fourier", observation="cores", iterations=5, batch=8, device="cpu", time_budget=1.0)
+    assert network.left_open == ("sigma", "learning_rate")
+    assert choose("paper").left_open == ("batch", "device")
+    assert choose("paper", motion="none", encoding="none", batch=8, device="cpu").left_open == ()
+
+
+@pytest.mark.parametrize("choices", [{}, *ALL_KINDS])
+def test_every_knob_has_a_keyword_that_takes_its_value(choices):
+    settings, known = choose(**choices), all_keywords()
+    for name in settings.knobs:
+        assert known[name].allows(settings.value_of(name))
 
 
 @pytest.mark.parametrize("owner", [Settings, *METHODS.values(), *MOTIONS.values(), *ENCODINGS.values()])
