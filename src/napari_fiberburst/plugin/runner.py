@@ -145,7 +145,8 @@ class Runner(QObject):
         bar = self._progress
         if bar is not None and bar.total != report.iterations:
             bar.total = report.iterations
-        if self._progress is bar and bar is not None:  # a change of its total lets events through, the end of the run among them
+        # A change of its total lets events through, the end of the run among them.
+        if self._progress is bar and bar is not None:
             bar.update(report.step - bar.n)
 
     def _end(self) -> None:
