@@ -1,17 +1,21 @@
 """A bundle in the dock: picked, opened, kept, and used for one single frame."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from napari.layers import Image, Points
 from napari.utils.notifications import notification_manager
+from npe2 import PluginManifest
 
+import napari_fiberburst
 from napari_fiberburst import Bundle
 from napari_fiberburst.errors import BundleError
 from napari_fiberburst.plugin import contributions
 
 MILLISECONDS = 60_000
+ROOT = Path(napari_fiberburst.__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +60,18 @@ def test_a_bundle_opens_as_its_transmission_and_its_cores(bundle, tmp_path):
     colours = {state: layer.border_color[states == state] for state in ("core", "saturated", "dead")}
     assert all((colour == colour[0]).all() for colour in colours.values())
     assert len({tuple(colour[0]) for colour in colours.values()}) == 3
+
+
+def test_napari_opens_a_bundle_by_the_manifest(make_napari_viewer, npe2pm, bundle, bundle_file):
+    npe2pm.register(PluginManifest.from_file(ROOT / "napari.yaml"))
+    viewer = make_napari_viewer()
+    viewer.open(str(bundle_file), plugin="napari-fiberburst")
+    assert [layer.name for layer in viewer.layers] == ["probe", "probe cores"]
+    opened = viewer.layers["probe"].metadata["fiberburst"]["bundle"]
+    np.testing.assert_array_equal(opened.gains, bundle.gains)
+    bundle_file.write_bytes(bundle_file.read_bytes()[:500])
+    with pytest.raises(BundleError, match="is no bundle, or is damaged"):
+        viewer.open(str(bundle_file), plugin="napari-fiberburst")
 
 
 def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
