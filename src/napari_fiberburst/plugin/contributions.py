@@ -20,8 +20,8 @@ LayerData = tuple[Any, dict[str, Any], str]
 _PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
-# Colours of cores in a bundle's layer, as `Bundle.picture` has them, and the quantile that is shown white.
-_CORE, _SATURATED, _DEAD = "#7bc86c", "#ff4d4d", "#3366ff"
+# RGBA of a bundle's cores by their state, as `Bundle.picture` has them, and the quantile of light that is shown white.
+_CORE_COLOURS = {"core": (0.5, 0.8, 0.4, 1.0), "saturated": (1.0, 0.3, 0.3, 1.0), "dead": (0.2, 0.4, 1.0, 1.0)}
 _BRIGHTEST = 0.99
 
 
@@ -100,14 +100,13 @@ def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
     layers: list[LayerData] = [(bundle.transmission, look, "image")]
     if bundle.is_resolved:
         states = np.append(np.where(bundle.saturated, "saturated", "core"), ["dead"] * len(bundle.dead))
-        colours = {"core": _CORE, "saturated": _SATURATED, "dead": _DEAD}
         cores = {
             "name": f"{name} cores",
             "axis_labels": ("y", "x"),
             "size": 2 * bundle.radius,
             "features": {"state": states},
             "face_color": "transparent",
-            "border_color": [colours[state] for state in states],
+            "border_color": np.array([_CORE_COLOURS[state] for state in states]),
         }
         layers.append((np.concatenate([bundle.centres, bundle.dead])[:, ::-1], cores, "points"))
     return layers

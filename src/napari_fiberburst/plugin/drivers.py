@@ -13,10 +13,10 @@ _MAPS = Path("/proc/self/maps")
 def without_clash(maps: Path = _MAPS) -> Iterator[None]:
     """Let no import of triton succeed where a driver has loaded LLVM, as Mesa's have once a canvas is drawn.
 
-    torch's optimisers import triton, which comes with torch from PyPI, for nothing that is used here. From 3.7 on it
-    shows its own LLVM to the whole process; where there is another the import ends in a segmentation fault, and napari
-    with it (https://github.com/tensorflow/tensorflow/issues/124205 is the same clash). torch goes on as where triton
-    is not installed.
+    torch's optimisers import triton, which is installed with torch from PyPI, although nothing here uses it. From 3.7
+    on, triton exposes its own LLVM to the whole process; where another one is loaded, the import ends in a
+    segmentation fault, which ends napari (https://github.com/tensorflow/tensorflow/issues/124205 is the same clash).
+    torch then works as if triton were not installed.
 
     Parameters
     ----------

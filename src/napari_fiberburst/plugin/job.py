@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Comparing a picture with the truth takes as long as some steps do; a run that is watched must not be slowed.
+# Comparing a picture with the truth takes as long as some steps do, and must not slow the run down.
 _SCORING_SHARE = 0.05
 
 
@@ -192,7 +192,7 @@ def score(picture: NDArray[np.float32], homographies: NDArray[np.float64], truth
 
     shown = picture if picture.ndim == 3 else picture[..., None]
     known = np.isfinite(shown)
-    # Where no core has looked there is nothing to compare: the mean stands for it, as a viewer's eye would have it.
+    # Pixels that no core has seen take the mean, because there is nothing to compare.
     shown = np.where(known, shown, shown.mean(axis=(0, 1), where=known))
     wanted = truth.picture
     if shown.shape != wanted.shape:
@@ -218,7 +218,7 @@ def _cropped(source: BurstSource) -> Truth | None:
 
 
 def _explain(error: Exception) -> str:
-    """Say what an unforeseen error means for the user; torch tells of too little memory in a RuntimeError."""
+    """Say what an unforeseen error means for the user; torch raises a RuntimeError where there is too little memory."""
     words = str(error).lower()
     if isinstance(error, MemoryError) or "out of memory" in words or "allocate memory" in words:
         return (

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
     from napari_fiberburst.results.reconstruction import Reconstruction
 
-# Outlines are drawn anew at most this often, for a layer of shapes is slow to come and to change.
+# Outlines are drawn anew at most this often, because a layer of shapes is slow to add and to change.
 _SECONDS_BETWEEN_OUTLINES = 5.0
 # ... and then take at most this part of the time.
 _OUTLINES_SHARE = 0.05

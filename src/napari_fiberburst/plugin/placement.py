@@ -17,7 +17,7 @@ _DARKEST, _BRIGHTEST = 0.1, 99.9
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placement:
-    """How a burst stands in the viewer, as it did when the run began: its layers may be gone when the picture comes.
+    """Where a burst lay in the viewer when its run began, because its layers may be gone when the run ends.
 
     Attributes
     ----------
@@ -79,8 +79,8 @@ class Placement:
     def arrange(self, array: Any, have: str) -> tuple[Any, str]:
         """Put an array's axes `have` into the layer's order; return it and the axes it has now.
 
-        Axes that it lacks are left out where they would come first, for layers broadcast along those, and repeated
-        without copying anywhere else.
+        Axes that it lacks are left out where they would come first, because layers broadcast along those, and are
+        repeated without copying anywhere else.
         """
         wanted = self.axes
         if "T" in have and "T" not in wanted:  # of one frame, in a layer without time

@@ -1,4 +1,4 @@
-"""Runs a job beside the window: one at a time, steered by events, ended in one of three ways."""
+"""Runs one job at a time in a worker thread, pauses and stops it, and says how it has ended."""
 
 import io
 import time
@@ -103,7 +103,7 @@ class Runner(QObject):
             self._set(state="stopping")
 
     def shut_down(self) -> None:
-        """Stop for good, without a word: the window is going. May be called more than once."""
+        """Stop for good, without a signal, because the window is closing. May be called more than once."""
         if self._job is not None and self._worker is not None:
             self._worker.finished.disconnect(self._end)
             self._worker.finished.connect(self._job.release)
@@ -124,7 +124,7 @@ class Runner(QObject):
             (job.reports, self.reported, _WORDS_SHARE),
         ):
             if self._job is not job:
-                return  # napari's progress bar lets events through, the end of the run among them
+                return  # napari's progress bar processes events, the end of the run among them
             # The first picture is what a user waits for.
             is_first = box is job.previews and not self._has_picture
             is_due = last or is_first or now - self._drawn >= self._drawing / share
@@ -145,9 +145,8 @@ class Runner(QObject):
         bar = self._progress
         if bar is not None and bar.total != report.iterations:
             bar.total = report.iterations
-        if (
-            self._progress is bar and bar is not None
-        ):  # a change of its total lets events through, the end of the run among them
+        # A change of its total processes events, the end of the run among them.
+        if self._progress is bar and bar is not None:
             bar.update(report.step - bar.n)
 
     def _end(self) -> None:
