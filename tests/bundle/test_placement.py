@@ -99,7 +99,7 @@ def test_another_bundle_of_the_same_pitch_is_refused(probe, jitter, another):
 def test_frames_too_dark_to_show_cores_are_refused(probe):
     there = probe()
     black = Burst(np.random.default_rng(0).integers(0, 3, there.burst.shape, np.uint8), white_level=255)
-    with pytest.raises(BundleError, match="another bundle|show 0 cores"):
+    with pytest.raises(BundleError, match="another bundle"):
         find_bundle(there.bundle, torch.from_numpy(black.frames).mean(dim=3), black)
 
 

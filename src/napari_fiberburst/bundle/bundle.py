@@ -367,21 +367,24 @@ class Bundle(Stored):
 
     def _check(self) -> None:
         """Refuse contents that do not belong together."""
+        for name in ("centres", "transmission", "gains", "offsets", "dead"):
+            if getattr(self, name).ndim != 2 or 0 in getattr(self, name).shape[1:]:
+                raise ValueError(f"{name} is of shape {getattr(self, name).shape}, expected two axes")
         count, shape = len(self.centres), self.transmission.shape
         expected: dict[str, tuple[str, tuple[int, ...]]] = {
             "centres": ("float64", (count, 2)),
             "labels": ("int32", shape),
-            "transmission": ("float32", (*shape[:1], *shape[1:2])),
-            "gains": ("float32", (count, *self.gains.shape[1:2])),
+            "transmission": ("float32", shape),
+            "gains": ("float32", (count, self.gains.shape[1])),
             "gain_weights": ("float32", (count,)),
-            "offsets": ("float32", (count, *self.offsets.shape[1:2])),
+            "offsets": ("float32", (count, self.offsets.shape[1])),
             "dead": ("float64", (len(self.dead), 2)),
             "saturated": ("bool", (count,)),
             "outline": ("bool", shape),
         }
         for name, (dtype, wanted) in expected.items():
             array = getattr(self, name)
-            if array.dtype != dtype or array.shape != wanted or (array.ndim == 2 and not array.shape[1]):
+            if array.dtype != dtype or array.shape != wanted:
                 raise ValueError(f"{name} is {array.dtype} of shape {array.shape}, expected {dtype} of {wanted}")
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise ValueError(f"{name} holds NaN or infinity")

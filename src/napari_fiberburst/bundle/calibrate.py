@@ -8,14 +8,13 @@ apart after the frames have been registered (`napari_fiberburst.motion.joint`, `
 from collections.abc import Generator
 from dataclasses import replace
 from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst import __version__
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
@@ -78,7 +77,7 @@ def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, 
     """Calibrate the bundle from grey frames (T, H, W) in [0, 1]; yields the name of each step that is done."""
     mean = grey[exposed(grey)].mean(dim=0)
     origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
-    bundle = yield from calibrating_mean(mean, acquisition, origin)
+    bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin)), grey)
     if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
         samples = sample_cores(grey[..., None], bundle, acquisition)
         light = samples.values[..., 0]
@@ -95,7 +94,7 @@ def calibrating_mean(
 
     In even light the picture is the transmission; otherwise its slow changes are divided out of it.
     """
-    told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": __version__}
+    told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": _version()}
     gain_weight = 1.0 if even_light else 0.0
     pitch = find_pitch(mean)
     yield "pitch found"
@@ -131,8 +130,8 @@ def calibrating_mean(
         offsets=np.zeros((count, 1), np.float32),
         black=in_units(black, acquisition),
         dead=find_gaps(centres, filled, pitch),
-        saturated=_saturated(mean, labels, count),
-        outline=outline.cpu().numpy(),
+        saturated=np.zeros(count, dtype=bool),
+        outline=filled | (labels < count),
         provenance=told,
     )
     return with_transmission(draft, passed)
@@ -157,6 +156,18 @@ def with_transmission(bundle: Bundle, transmission: Tensor) -> Bundle:
         centres = torch.from_numpy(bundle.centres).to(transmission)
         radius = footprint_radius(transmission, labels, centres, bundle.pitch)
     return replace(bundle, transmission=transmission.cpu().numpy(), radius=radius)
+
+
+def with_saturated(bundle: Bundle, frames: Tensor) -> Bundle:
+    """Return the bundle with those cores marked that are too bright for the camera in most frames (T, H, W).
+
+    In most of their light: the dark rim that belongs to a core's cell does not saturate.
+    """
+    own = bundle.labels < len(bundle.centres)
+    labels, mass = bundle.labels[own], bundle.transmission[own].astype(np.float64) ** 2
+    often = (frames >= SATURATED).float().mean(dim=0).cpu().numpy()[own]
+    total, too_bright = (np.bincount(labels, part, len(bundle.centres)) for part in (mass, mass * often))
+    return replace(bundle, saturated=too_bright > 0.5 * np.maximum(total, 1e-12))
 
 
 def with_even_gains(bundle: Bundle) -> Bundle:
@@ -201,13 +212,11 @@ def thinned(values: Tensor) -> Tensor:
     return flat[:: max(1, len(flat) // 100_000)]
 
 
-def _saturated(mean: Tensor, labels: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    """Return which cores are, in most of their pixels, too bright for the camera, (N,)."""
-    own = labels < count
-    too_bright = (mean.cpu().numpy() >= SATURATED)[own].astype(np.float64)
-    size = np.bincount(labels[own], minlength=count)
-    saturated: NDArray[np.bool_] = np.bincount(labels[own], too_bright, count) > 0.5 * np.maximum(size, 1)
-    return saturated
+def _version() -> str:
+    try:
+        return version("napari-fiberburst")
+    except PackageNotFoundError:  # run from its sources
+        return "unknown"
 
 
 def _blocks(

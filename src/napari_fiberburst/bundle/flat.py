@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle, Pictures
-from napari_fiberburst.bundle.calibrate import calibrating_mean, in_units, thinned
+from napari_fiberburst.bundle.calibrate import calibrating_mean, in_units, thinned, with_saturated
 from napari_fiberburst.bundle.samples import SATURATED, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
@@ -47,7 +47,7 @@ def calibrate_flat(image: Pictures, dark: Pictures | None, *, device: str = "aut
         darkness = torch.from_numpy((black.mean(axis=0) - levels.black_level) / span).float().to(place)
         bundle = _found(light - darkness.mean(dim=2), levels, {**origin, "dark": _files(dark)}, name)
         bundle = _with_dark(bundle, darkness, levels)
-    return _with_channels(bundle, frames, levels)
+    return _with_channels(with_saturated(bundle, frames.amax(dim=3)), frames, levels)
 
 
 def _found(light: Tensor, acquisition: Acquisition, origin: dict[str, Any], name: str) -> Bundle:

@@ -20,9 +20,12 @@ from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
 from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import Scene
+from napari_fiberburst.scene.spline import assemble
 
 # Less than this part of a sample is the rim of one.
 _LEAST_COVERAGE = 0.1
+# Iterations of conjugate gradients for what a scene makes of wrong gains; and the least part that it does not follow.
+_PROBE_ITERATIONS, _LEAST_FREE = 25, 0.05
 # A core is saturated that has no sample in this part of the frames.
 _MOSTLY = 0.5
 
@@ -62,6 +65,7 @@ def diagnose(
     canvas = Canvas.over((0, 0, samples.shape[1], samples.shape[0])) if canvas is None else canvas
     span = acquisition.white_level - acquisition.black_level
     ratios, weights = measured_gains(samples, points, scene.grid, scene.filtered)
+    ratios, weights = _held_to_others(ratios, weights, scene, points, registration)
     found = Diagnostics(
         coverage=_coverage(samples, points, registration, scene.grid, canvas),
         bundle=_as_seen(bundle, registration, scene, weights),
@@ -85,6 +89,35 @@ def diagnose(
         sample_error=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
         resolution=scene.resolution,
     )
+
+
+def _held_to_others(
+    ratios: Tensor, weights: Tensor, scene: Scene, points: Tensor, registration: Registration
+) -> tuple[Tensor, Tensor]:
+    """Return gains (G,) as other cores see them, and what light they rest on.
+
+    The scene was solved from a core's own samples too, so it follows an error of the core's gain by some part: the gain
+    seems nearer to 1 than it is, and less is known of it than its light would tell. That part is measured: gains that
+    are wrong at random are put before the scene. A burst that does not move follows them all the way.
+    """
+    if registration.is_still:
+        return torch.ones_like(ratios), torch.zeros_like(weights)
+    samples = scene.samples
+    generator = torch.Generator().manual_seed(0)
+    signs = (2 * torch.randint(2, (samples.cores,), generator=generator) - 1).to(points)[samples.core_index]
+    light = torch.zeros_like(samples.weights)
+    for number in np.flatnonzero(registration.used):
+        light[number] = scene.grid.at(points[number]).read(scene.filtered.mean(dim=0))
+    wrong = assemble(scene.grid, replace(samples, values=(signs * light)[..., None]), points)
+    followed = wrong.through(wrong.solve(scene.smoothness, wrong.mean(), _PROBE_ITERATIONS))[0]
+    agreement = power = torch.zeros(()).to(points)
+    for number in np.flatnonzero(registration.used):
+        at = scene.grid.at(points[number])
+        expected = samples.weights[number] * at.inside * light[number]
+        agreement = agreement + (expected * signs * at.read(followed)).sum()
+        power = power + (expected * light[number]).sum()
+    free = min(max(1 - float(agreement / power.clamp_min(1e-12)), _LEAST_FREE), 1.0)
+    return (1 + (ratios - 1) / free).clamp_min(0), weights * free
 
 
 def _places(canvas: Canvas, like: Tensor) -> Tensor:
