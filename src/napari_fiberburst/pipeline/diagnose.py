@@ -106,16 +106,15 @@ def _held_to_others(
     generator = torch.Generator().manual_seed(0)
     signs = (2 * torch.randint(2, (samples.cores,), generator=generator) - 1).to(points)[samples.core_index]
     light = torch.zeros_like(samples.weights)
-    for number in np.flatnonzero(registration.used):
-        light[number] = scene.grid.at(points[number]).read(scene.filtered.mean(dim=0))
-    wrong = assemble(scene.grid, replace(samples, values=(signs * light)[..., None]), points)
-    followed = wrong.through(wrong.solve(scene.smoothness, wrong.mean(), _PROBE_ITERATIONS))[0]
+    for seen in predict(samples, points, scene.grid, scene.filtered.mean(dim=0, keepdim=True)):
+        light[seen.frame] = seen.light[:, 0]
+    wrong = replace(samples, values=(signs * light)[..., None])
+    equations = assemble(scene.grid, wrong, points)
+    followed = equations.through(equations.solve(scene.smoothness, equations.mean(), _PROBE_ITERATIONS))
     agreement = power = torch.zeros(()).to(points)
-    for number in np.flatnonzero(registration.used):
-        at = scene.grid.at(points[number])
-        expected = samples.weights[number] * at.inside * light[number]
-        agreement = agreement + (expected * signs * at.read(followed)).sum()
-        power = power + (expected * light[number]).sum()
+    for seen in predict(wrong, points, scene.grid, followed):
+        agreement = agreement + (seen.weights * (seen.values * seen.light)[:, 0]).sum()
+        power = power + (seen.weights * seen.values[:, 0] ** 2).sum()
     free = min(max(1 - float(agreement / power.clamp_min(1e-12)), _LEAST_FREE), 1.0)
     return (1 + (ratios - 1) / free).clamp_min(0), weights * free
 
