@@ -85,7 +85,7 @@ class Shown:
     def at(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the picture at frame-0 points, by cubic splines."""
         points = np.stack([x, y, np.ones_like(x)])
-        column, row, depth = np.tensordot(np.linalg.inv(self.canvas.frame0_from_image), points, axes=1)
+        column, row, depth = np.tensordot(np.linalg.inv(self.canvas.reference_from_image), points, axes=1)
         found: NDArray[np.float64] = map_coordinates(
             self._coefficients, (row / depth, column / depth), order=3, mode="nearest", prefilter=False
         )

@@ -157,7 +157,7 @@ def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> tup
     # Its pixels reach from the centre of the first pixel of the square to that of the last.
     step = (SIZE - 1) / (SCALE * SIZE - 1)
     matrix = np.array([[step, 0, CORNER[0]], [0, step, CORNER[1]], [0, 0, 1]])
-    return Shown(picture[..., 0], Canvas(shape=picture.shape[:2], frame0_from_image=matrix)), seconds
+    return Shown(picture[..., 0], Canvas(shape=picture.shape[:2], reference_from_image=matrix)), seconds
 
 
 def _prediction_error(real: RealBurst, shown: Shown, left: int) -> float:

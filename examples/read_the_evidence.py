@@ -30,7 +30,9 @@ empty: NDArray[np.bool_] = np.isnan(result.image)
 print(
     f"{measured.mean():.0%} of the pixels lie under a core's footprint in some frame, {empty.mean():.0%} are left empty"
 )
-print(f"typical uncertainty {np.nanmedian(result.uncertainty):.2g}, left-out samples: off by {result.sample_error:.2g}")
+print(
+    f"typical uncertainty {np.nanmedian(result.uncertainty):.2g}, left-out samples: off by {result.held_out_rmse:.2g}"
+)
 
 truth = simulated.truth[0, ..., 0]
 off = np.full(truth.shape, np.nan)

@@ -4,9 +4,9 @@ import threading
 from collections.abc import Callable
 
 from napari_fiberburst.settings import Fourier, NetworkMethod
-from napari_fiberburst.settings.parameter import knobs_of
+from napari_fiberburst.settings.parameter import parameters_of
 
-_KNOBS = {"sigma": knobs_of(Fourier)["sigma"], "learning_rate": knobs_of(NetworkMethod)["learning_rate"]}
+_PARAMETERS = {"sigma": parameters_of(Fourier)["sigma"], "learning_rate": parameters_of(NetworkMethod)["learning_rate"]}
 # How often a paused run asks whether it should end.
 _SECONDS_BETWEEN_LOOKS = 0.1
 
@@ -87,5 +87,5 @@ class Control:
 def _checked(name: str, value: float | None) -> float | None:
     """Return a live value by the rule that its setting has."""
     if value is not None:
-        _KNOBS[name].check(value)
+        _PARAMETERS[name].check(value)
     return value

@@ -50,7 +50,7 @@ def test_what_is_known_comes_with_the_picture(cores, fitted):
     # Off frame 0's own view coverage falls; about the middle all frames have looked.
     per_pixel = count * 12 * np.pi * fitted.bundle.radius**2 / np.prod(SHAPE)
     assert np.median(fitted.coverage) == pytest.approx(per_pixel, rel=0.4)
-    assert fitted.sample_error == pytest.approx(np.sqrt(np.nanmean(fitted.residuals**2)), rel=0.6)
+    assert fitted.held_out_rmse == pytest.approx(np.sqrt(np.nanmean(fitted.residuals**2)), rel=0.6)
 
 
 def test_uncertainty_is_of_the_size_of_the_noise(cores, fitted):
@@ -74,7 +74,7 @@ def test_previews_begin_early_and_get_better(cores):
     assert quality[-1] == max(quality)
     errors = [motion_error(report.homographies, cores.homographies, SHAPE) for report in previews]
     assert errors[-1] < 0.3 * errors[0] + 0.05
-    assert reports[-1].sample_error == result.sample_error
+    assert reports[-1].held_out_rmse == result.held_out_rmse
     assert reports[-1].step == reports[-1].iterations
 
 
@@ -143,7 +143,7 @@ def test_networks_run_on_the_same_samples(encoding):
     result = reconstruct(simulated.burst, encoding=encoding, iterations=40, fill=True, **small)
     assert result.image.shape == (67, 81, 3)
     assert np.isfinite(result.image).all()
-    assert result.sample_error > 0
+    assert result.held_out_rmse > 0
     assert result.coverage.shape == (67, 81)
     # The registration it starts from is kept, or bettered.
     assert motion_error(result.homographies, simulated.homographies, (67, 81)) < 0.6
@@ -158,7 +158,7 @@ def test_a_network_ends_where_it_stops_meeting_unseen_samples_better(monkeypatch
     assert result.ending == "finished"
     assert len(result.losses) < 2000
     # It overfits later: the last losses are lower than those of the state that was kept.
-    assert result.sample_error > 0
+    assert result.held_out_rmse > 0
 
 
 def test_flow_starts_from_the_registration():
@@ -193,7 +193,7 @@ def test_rounds_can_be_limited(cores):
     full = reconstruct(cores.burst, fill=True)
     assert len(quick.losses) < len(full.losses)
     assert (quick.confidence > 0.5).all()
-    assert quick.sample_error < 5 * full.sample_error
+    assert quick.held_out_rmse < 5 * full.held_out_rmse
 
 
 def test_very_dim_recordings_do_as_well(cores, fitted):

@@ -57,14 +57,14 @@ def test_only_what_applies_is_shown(form):
 
 @pytest.mark.parametrize("encoding", ENCODING_NAMES)
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_every_choice_shows_every_knob_it_has(form, motion, encoding):
+def test_every_choice_shows_every_parameter_it_has(form, motion, encoding):
     form.boxes["motion"].setCurrentText(motion)
     form.boxes["encoding"].setCurrentText(encoding)
     if form.problem:
         assert "needs a network encoding" in form.problem
         assert form.problem in [label.text() for label in form.findChildren(QLabel) if not label.isHidden()]
     else:
-        wanted = set(choose(motion=motion, encoding=encoding).knobs) - {"preview_every", "device"}
+        wanted = set(choose(motion=motion, encoding=encoding).parameters) - {"preview_every", "device"}
         assert form.shown == wanted
 
 
@@ -77,8 +77,8 @@ def test_a_preset_sets_everything_back(form):
 
 
 def test_tooltips_are_the_settings_own_words(form):
-    knob = choose().knobs["upsample"]
-    assert knob.doc in form.rows["upsample"].toolTip()
+    parameter = choose().parameters["upsample"]
+    assert parameter.doc in form.rows["upsample"].toolTip()
     tips = [
         form.boxes["encoding"].itemData(row, Qt.ItemDataRole.ToolTipRole)
         for row in range(form.boxes["encoding"].count())
@@ -86,7 +86,7 @@ def test_tooltips_are_the_settings_own_words(form):
     assert tips == [text for part, _, text in choice_docs() if part == "encoding"]
 
 
-def test_an_open_knob_shows_what_was_chosen_and_stays_open(form):
+def test_an_open_parameter_shows_what_was_chosen_and_stays_open(form):
     form.set_choices({"encoding": "fourier"})
     form.show_chosen(choose(encoding="fourier", sigma=3.25))
     assert form.rows["sigma"].auto.text() == "auto (3.25)"
@@ -116,7 +116,7 @@ def test_a_missing_device_is_locked_with_its_reason(form):
 
 
 def test_choices_of_another_version_are_left_out(form):
-    form.set_choices({"no_such_knob": 3})
+    form.set_choices({"no_such_parameter": 3})
     assert form.choices() == {}
 
 

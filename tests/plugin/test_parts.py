@@ -137,7 +137,7 @@ def test_a_turned_layer_has_its_picture_in_the_same_place():
     canvas = Canvas.over((0, 0, 20, 20), 2.0)
     shown = Image(np.zeros(canvas.shape, np.float32), **placement.on_canvas("YX", canvas))
     for x, y in ((0, 0), (39, 0), (17, 33)):
-        frame_x, frame_y, _ = canvas.frame0_from_image @ [x, y, 1]
+        frame_x, frame_y, _ = canvas.reference_from_image @ [x, y, 1]
         expected = layer.data_to_world((0, frame_y + 3, frame_x + 4))[-2:]
         np.testing.assert_allclose(shown.data_to_world((y, x)), expected, atol=1e-9)
 

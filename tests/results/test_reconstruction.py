@@ -14,7 +14,7 @@ from napari_fiberburst.errors import OutputError, SettingsError
 def test_a_canvas_at_scale_1_is_the_frame():
     canvas = Canvas.over((0, 0, 37, 31))
     assert canvas.shape == (31, 37)
-    np.testing.assert_array_equal(canvas.frame0_from_image, np.eye(3))
+    np.testing.assert_array_equal(canvas.reference_from_image, np.eye(3))
     np.testing.assert_array_equal(canvas.points()[4, 6], [6, 4])
 
 
@@ -35,7 +35,7 @@ def test_bounds_are_half_open_and_may_leave_the_frame():
 def test_a_scale_that_does_not_divide_still_covers_the_bounds():
     canvas = Canvas.over((0, 0, 37, 31), 0.3)
     assert canvas.shape == (9, 11)
-    points, step = canvas.points(), np.diag(canvas.frame0_from_image)[:2]
+    points, step = canvas.points(), np.diag(canvas.reference_from_image)[:2]
     np.testing.assert_allclose(points[0, 0] - step / 2, [-0.5, -0.5])
     np.testing.assert_allclose(points[-1, -1] + step / 2, [36.5, 30.5])
 
@@ -167,6 +167,26 @@ def test_a_saved_representation_draws_the_same_picture(result, tmp_path):
     assert again.settings == result.settings
     assert again.acquisition.to_dict() == result.acquisition.to_dict()
     np.testing.assert_array_equal(again.frame(2, scale=1.7), result.frame(2, scale=1.7))
+
+
+def test_a_file_of_the_first_version_is_still_read(result, tmp_path):
+    path = result.save(tmp_path / "networks.npz")
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored}
+    written = json.loads(str(arrays["provenance"]))
+    method = written["settings"]["method"]
+    del written["requested"]
+    written["settings"] = {
+        **{name: value for name, value in method.items() if name not in ("name", "samples")},
+        **{name: value for name, value in written["settings"].items() if name != "method"},
+        "observation": "frames",
+    }
+    written["sample_error"] = written.pop("held_out_rmse")
+    written["canvas"]["frame0_from_image"] = written["canvas"].pop("reference_from_image")
+    np.savez(path, **{**arrays, "provenance": np.array(json.dumps(written))})
+    again = load(path)
+    np.testing.assert_array_equal(again.image, result.image)
+    assert again.settings == result.settings
 
 
 def test_a_loaded_representation_can_be_continued(result, fit, tiny_burst, tmp_path):

@@ -29,7 +29,7 @@ from napari_fiberburst.settings import (
     all_keywords,
     choose,
 )
-from napari_fiberburst.settings.parameter import knobs_of
+from napari_fiberburst.settings.parameter import parameters_of
 
 
 def test_the_paper_preset_has_the_published_values():
@@ -183,9 +183,9 @@ ALL_KINDS = [
 def test_the_flat_keywords_give_the_settings_back(choices):
     settings = choose(**choices)
     assert choose(**settings.flat()) == settings
-    assert set(settings.flat()) == {"motion", "encoding", *settings.knobs}
+    assert set(settings.flat()) == {"motion", "encoding", *settings.parameters}
     for name, value in choices.items():
-        if name in settings.knobs:
+        if name in settings.parameters:
             assert settings.value_of(name) == value
     with pytest.raises(SettingsError, match="is no setting"):
         settings.value_of("sgima")
@@ -284,14 +284,14 @@ def test_what_is_left_open_is_named():
 
 
 @pytest.mark.parametrize("choices", [{}, *ALL_KINDS])
-def test_every_knob_has_a_keyword_that_takes_its_value(choices):
+def test_every_parameter_has_a_keyword_that_takes_its_value(choices):
     settings, known = choose(**choices), all_keywords()
-    for name in settings.knobs:
+    for name in settings.parameters:
         assert known[name].allows(settings.value_of(name))
 
 
 @pytest.mark.parametrize("owner", [Settings, *METHODS.values(), *MOTIONS.values(), *ENCODINGS.values()])
-def test_every_knob_tells_what_it_does(owner):
-    for knob in knobs_of(owner).values():
-        assert knob.doc.endswith(".")
-        assert knob.allows(knob.default)
+def test_every_parameter_tells_what_it_does(owner):
+    for parameter in parameters_of(owner).values():
+        assert parameter.doc.endswith(".")
+        assert parameter.allows(parameter.default)

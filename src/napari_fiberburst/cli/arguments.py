@@ -4,17 +4,17 @@ import argparse
 from typing import Any, NoReturn
 
 from napari_fiberburst.settings import ENCODING_NAMES, MOTIONS, PRESETS, all_keywords, choice_docs, owners_of
-from napari_fiberburst.settings.parameter import Knob
+from napari_fiberburst.settings.parameter import Parameter
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add an option for the preset, the motion, the encoding, and every knob there is."""
+    """Add an option for the preset, the motion, the encoding, and every parameter there is."""
     parser.add_argument("--preset", choices=PRESETS, default=next(iter(PRESETS)), help="where settings start from")
     for part, known in (("motion", tuple(MOTIONS)), ("encoding", ENCODING_NAMES)):
         texts = [f"{name}: {text}" for of, name, text in choice_docs() if of == part]
         parser.add_argument(f"--{part}", choices=known, help=" ".join(texts).replace("%", "%%"))
-    for name, knob in all_keywords().items():
-        _add(parser, knob, " and ".join(choice for _, choice in owners_of(name)))
+    for name, parameter in all_keywords().items():
+        _add(parser, parameter, " and ".join(choice for _, choice in owners_of(name)))
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -41,18 +41,18 @@ def parse_shape(text: str) -> tuple[int, int]:
     return height, width
 
 
-def _add(parser: argparse.ArgumentParser, knob: Knob, owner: str) -> None:
-    default = "" if knob.default is None else f"default {knob.default}"
+def _add(parser: argparse.ArgumentParser, parameter: Parameter, owner: str) -> None:
+    default = "" if parameter.default is None else f"default {parameter.default}"
     remarks = "; ".join(filter(None, [owner and f"{owner} only", default]))
-    text = f"{knob.doc} ({remarks})" if remarks else knob.doc
-    if knob.kind is bool:
-        parser.add_argument(f"--{knob.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
+    text = f"{parameter.doc} ({remarks})" if remarks else parameter.doc
+    if parameter.kind is bool:
+        parser.add_argument(f"--{parameter.name.replace('_', '-')}", action=argparse.BooleanOptionalAction, help=text)
         return
-    if knob.choices:
-        parser.add_argument(f"--{knob.name.replace('_', '-')}", choices=knob.choices, help=text)
+    if parameter.choices:
+        parser.add_argument(f"--{parameter.name.replace('_', '-')}", choices=parameter.choices, help=text)
         return
     parser.add_argument(
-        f"--{knob.name.replace('_', '-')}", type=knob.kind, metavar=knob.kind.__name__.upper(), help=text
+        f"--{parameter.name.replace('_', '-')}", type=parameter.kind, metavar=parameter.kind.__name__.upper(), help=text
     )
 
 

@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     sheet = _side_by_side({**pictures, "truth": truth}, truth)
     with write_whole(options.output) as stream:
         stream.write(sheet)
-    print(f"samples left out are met to {result.sample_error:.2f} of 255; resolution {result.resolution:.1f} px")
+    print(f"samples left out are met to {result.held_out_rmse:.2f} of 255; resolution {result.resolution:.1f} px")
     print(f"{result.seconds:.1f} s on {result.device}; wrote {options.output}")
     return 0
 

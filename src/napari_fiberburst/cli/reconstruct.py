@@ -76,8 +76,8 @@ def run(options: argparse.Namespace) -> int:
     print(f"{result.ending} after {steps} steps in {result.seconds:.1f} s on {result.device}, {rate:.1f} it/s")
     if result.frames_used is not None:
         print(f"frames used {len(result.frames_used)} of {len(result.homographies)}")
-    if result.sample_error is not None:
-        print(f"samples left out are met to {result.sample_error:.3g} intensity units")
+    if result.held_out_rmse is not None:
+        print(f"samples left out are met to {result.held_out_rmse:.3g} intensity units")
     if result.resolution is not None:
         print(f"two halves of the burst agree down to periods of {result.resolution:.1f} pixels")
     if result.compression > 0:

@@ -19,12 +19,12 @@ class Canvas:
     ----------
     shape : (int, int)
         Height and width of the picture.
-    frame0_from_image : numpy.ndarray
+    reference_from_image : numpy.ndarray
         3x3: picture pixel (x, y) to frame-0 pixel; integers are pixel centres in both.
     """
 
     shape: tuple[int, int]
-    frame0_from_image: NDArray[np.float64]
+    reference_from_image: NDArray[np.float64]
 
     @classmethod
     def over(cls, bounds: tuple[float, float, float, float], scale: float = 1.0) -> "Canvas":
@@ -60,10 +60,10 @@ class Canvas:
         # Pixel edges meet the bounds, so the first centre lies half a step inside them.
         first_x, first_y = x0 - 0.5 + step_x / 2, y0 - 0.5 + step_y / 2
         matrix = np.array([[step_x, 0, first_x], [0, step_y, first_y], [0, 0, 1]], dtype=np.float64)
-        return cls(shape=(height, width), frame0_from_image=matrix)
+        return cls(shape=(height, width), reference_from_image=matrix)
 
     def points(self, first: int = 0, last: int | None = None) -> NDArray[np.float64]:
         """Return the frame-0 point (x, y) of every pixel of rows `first` up to `last`, (rows, W, 2)."""
         height, width = self.shape
         columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)[first:last])
-        return transform_points(self.frame0_from_image, np.stack([columns, rows], axis=-1))
+        return transform_points(self.reference_from_image, np.stack([columns, rows], axis=-1))

@@ -24,6 +24,8 @@ from napari_fiberburst.settings import NetworkMethod, Settings, SplineMethod, Tr
 _CHUNK = 16_384
 _DRAWN = "samples_drawn"
 _BEHIND = "behind."
+# Names in files of 0.1.0.
+_FORMER_NAMES = {"sample_error": "held_out_rmse", "frame0_from_image": "reference_from_image"}
 
 
 class Representation:
@@ -135,9 +137,16 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
     place = find_device(device)
     arrays, provenance = read_representation(path)
     try:
-        return _rebuild(arrays, provenance, place)
+        return _rebuild(arrays, _with_names_of_today(provenance), place)
     except (FiberBurstError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         raise OutputError(f"{path} is no reconstruction that this version can read: {error!r}") from error
+
+
+def _with_names_of_today(plain: Any) -> Any:
+    """Return what a file says with the names that its version had before replaced."""
+    if not isinstance(plain, dict):
+        return plain
+    return {_FORMER_NAMES.get(name, name): _with_names_of_today(value) for name, value in plain.items()}
 
 
 def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
@@ -145,7 +154,7 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
     acquisition = Acquisition.from_dict(provenance["burst"])
     canvas = Canvas(
         shape=tuple(provenance["canvas"]["shape"]),
-        frame0_from_image=np.array(provenance["canvas"]["frame0_from_image"]),
+        reference_from_image=np.array(provenance["canvas"]["reference_from_image"]),
     )
     reference = int(provenance.get("reference", 0))
     renderer: SplineImage | Representation
@@ -169,7 +178,7 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         acquisition=acquisition,
         renderer=renderer,
         reference=reference,
-        sample_error=provenance.get("sample_error"),
+        held_out_rmse=provenance.get("held_out_rmse"),
         frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
         confidence=None
         if provenance.get("confidence") is None

@@ -139,7 +139,7 @@ class Problem:
         self.optimizer.step()
         return loss.detach()
 
-    def sample_error(self) -> float | None:
+    def held_out_rmse(self) -> float | None:
         """Return the root mean square error, intensities in [0, 1], of samples that were left out; None without any."""
         left_out = self.samples.left_out() if isinstance(self.samples, BundleStream) else None
         if left_out is None:

@@ -80,13 +80,13 @@ def diagnose(
         return found
     residuals, variance = _residuals(samples, points, scene)
     most = max(float(scene.coefficients.std()), 1e-6)
-    deviation = scene.equations.deviation(scene.smoothness, variance, most, max(1.0, bundle.radius))
-    expected = scene.grid.at(_places(canvas, deviation))(deviation)
+    std = scene.equations.posterior_std(scene.smoothness, variance, most, max(1.0, bundle.radius))
+    expected = scene.grid.at(_places(canvas, std))(std)
     return replace(
         found,
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
         residuals=(residuals * span).cpu().numpy().astype(np.float32),
-        sample_error=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
+        held_out_rmse=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
         resolution=scene.resolution,
     )
 

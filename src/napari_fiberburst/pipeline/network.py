@@ -245,7 +245,7 @@ class Training:
             notes=fitted.all_notes,
             is_scene_shown=False,
         )
-        return {**found.by_name(), "sample_error": self._error_in_units()}
+        return {**found.by_name(), "held_out_rmse": self._error_in_units()}
 
     def _follow(self) -> None:
         """Take over what a user has changed since the last step."""
@@ -278,7 +278,7 @@ class Training:
 
     def _evaluate_held_out(self) -> bool:
         """Take the error of held-out samples, keep the state where it is the least; return whether it has converged."""
-        error = self._problem.sample_error()
+        error = self._problem.held_out_rmse()
         if error is None or not np.isfinite(error):
             return False
         if self._best is None or error < self._best[0]:

@@ -90,7 +90,7 @@ def reconstruct(
         exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
         Adam's moments start anew.
     **more
-        Any other knob of `Settings`, or of the method, motion or encoding chosen, by name: ``learning_rate=1e-3``,
+        Any other parameter of `Settings`, or of the method, motion or encoding chosen, by name: ``learning_rate=1e-3``,
         ``features=128``, ``preview_every=1.0``.
 
     Returns

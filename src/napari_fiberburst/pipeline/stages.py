@@ -275,8 +275,8 @@ class Stages:
     def _grid(self, spacing: float, fitted: Fitted) -> Grid:
         """Return a grid over the canvas and some more, its nodes on pixel centres where the spacing is a pixel's."""
         canvas = fitted.canvas
-        first = canvas.frame0_from_image[:2, 2]
-        last = first + canvas.frame0_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
+        first = canvas.reference_from_image[:2, 2]
+        last = first + canvas.reference_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
         return grid_over((*first.tolist(), *last.tolist()), spacing, fitted.bundle.pitch + fitted.bundle.radius)
 
 

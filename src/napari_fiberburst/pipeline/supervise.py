@@ -168,7 +168,7 @@ def _progress(
         settings=snapshot.settings,
         canvas=snapshot.canvas,
         preview=preview,
-        sample_error=snapshot.held_out_rmse,
+        held_out_rmse=snapshot.held_out_rmse,
     )
 
 

@@ -36,7 +36,7 @@ class Curves(QWidget):
         )
         self._lines = {
             "loss": self._fit.plot(pen=_pen(_LOSS), name="loss"),
-            "sample_error": self._fit.plot(
+            "held_out_rmse": self._fit.plot(
                 pen=_pen(_ERROR), symbol="o", symbolSize=5, name="error of samples left out"
             ),
             "psnr": self._truth.plot(pen=_pen(_PSNR), symbol="o", symbolSize=5, name="PSNR"),
@@ -72,8 +72,8 @@ class Curves(QWidget):
         scored = [(point.seconds, point.scores) for point in points if point.scores is not None]
         seconds = np.array([point.seconds for point in points])
         self._draw("loss", seconds, [point.loss for point in points])
-        errors = [np.nan if point.sample_error is None else (2 * point.sample_error / span) ** 2 for point in points]
-        self._draw("sample_error", seconds, errors)
+        errors = [np.nan if point.held_out_rmse is None else (2 * point.held_out_rmse / span) ** 2 for point in points]
+        self._draw("held_out_rmse", seconds, errors)
         if scored:
             at = np.array([moment for moment, _ in scored])
             self._truth.setVisible(True)

@@ -8,7 +8,7 @@ from qtpy.QtGui import QStandardItemModel
 from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.plugin.knob_rows import KnobRow
+from napari_fiberburst.plugin.parameter_rows import ParameterRow
 from napari_fiberburst.plugin.sections import form_layout, section
 from napari_fiberburst.settings import (
     ENCODING_NAMES,
@@ -31,7 +31,7 @@ _PRESET_TEXTS = {
 
 
 class SettingsForm(QWidget):
-    """Preset, motion, encoding and every knob that applies to them.
+    """Preset, motion, encoding and every parameter that applies to them.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class SettingsForm(QWidget):
     """
 
     changed = Signal()
-    turned_live = Signal(str, object)  # a knob that a running fit follows, and its value
+    turned_live = Signal(str, object)  # a parameter that a running fit follows, and its value
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -48,9 +48,11 @@ class SettingsForm(QWidget):
         self._preset, self._motion, self._encoding = (QComboBox() for _ in range(3))
         self._device = QComboBox()
         self._device.addItems(_DEVICES)
-        knobs = all_keywords()
-        self._device.setToolTip(knobs.pop("device").doc)
-        self._rows = {name: KnobRow(knob, self) for name, knob in knobs.items() if name not in _NOT_SHOWN}
+        parameters = all_keywords()
+        self._device.setToolTip(parameters.pop("device").doc)
+        self._rows = {
+            name: ParameterRow(parameter, self) for name, parameter in parameters.items() if name not in _NOT_SHOWN
+        }
         self._first, self._rest = form_layout(), form_layout()
         self._settings = PRESETS["auto"]
         self._is_running = False
@@ -59,8 +61,8 @@ class SettingsForm(QWidget):
         self._connect()
 
     @property
-    def rows(self) -> Mapping[str, KnobRow]:
-        """The knobs' rows by name, also of those that do not apply."""
+    def rows(self) -> Mapping[str, ParameterRow]:
+        """The parameters' rows by name, also of those that do not apply."""
         return self._rows
 
     @property
@@ -70,7 +72,7 @@ class SettingsForm(QWidget):
 
     @property
     def shown(self) -> set[str]:
-        """Names of the knobs that apply: those whose rows can be seen."""
+        """Names of the parameters that apply: those whose rows can be seen."""
         return {
             name
             for name, row in self._rows.items()
@@ -100,7 +102,7 @@ class SettingsForm(QWidget):
             if box.currentText() != start.flat()[part]:
                 named[part] = box.currentText()
         base = choose(**named)
-        values = {name: self._value(name) for name in base.knobs if name not in (*_NOT_SHOWN, "observation")}
+        values = {name: self._value(name) for name in base.parameters if name not in (*_NOT_SHOWN, "observation")}
         turned = {name: value for name, value in values.items() if value is not None and value != base.value_of(name)}
         choose(**named, **turned)
         return {**named, **turned}
@@ -117,9 +119,9 @@ class SettingsForm(QWidget):
         self.changed.emit()
 
     def show_chosen(self, settings: Settings) -> None:
-        """Say what a run has chosen for knobs that were left open."""
+        """Say what a run has chosen for parameters that were left open."""
         for name, row in self._rows.items():
-            if row.knob.optional and name in settings.knobs:
+            if row.parameter.optional and name in settings.parameters:
                 row.show_chosen(settings.value_of(name))
 
     def set_running(self, is_running: bool, *, is_network: bool = False) -> None:
@@ -213,8 +215,8 @@ class SettingsForm(QWidget):
         self.changed.emit()
 
     def _shared(self, base: Settings) -> dict[str, Any]:
-        """Return what the form says of the knobs that both the old and the new choice have."""
-        known = [name for name in base.knobs if name in self._settings.knobs and name not in _NOT_SHOWN]
+        """Return what the form says of the parameters that both the old and the new choice have."""
+        known = [name for name in base.parameters if name in self._settings.parameters and name not in _NOT_SHOWN]
         return {name: self._value(name) for name in known if name != "observation"}
 
     def _fill(self, preset: str, choices: Mapping[str, Any]) -> None:
@@ -226,7 +228,7 @@ class SettingsForm(QWidget):
         self._hint.setVisible(False)
 
     def _show(self, settings: Settings) -> None:
-        """Take the form to settings, and show only their knobs."""
+        """Take the form to settings, and show only their parameters."""
         self._settings = settings
         flat = settings.flat()
         for box in (self._motion, self._encoding, self._device):
@@ -247,10 +249,10 @@ class SettingsForm(QWidget):
             for number in range(layout.rowCount()):
                 item = layout.itemAt(number, QFormLayout.ItemRole.FieldRole)
                 row = None if item is None else item.widget()
-                if isinstance(row, KnobRow):
-                    layout.setRowVisible(number, row.knob.name in settings.knobs)
+                if isinstance(row, ParameterRow):
+                    layout.setRowVisible(number, row.parameter.name in settings.parameters)
         base = choose(self.preset, **{name: flat[name] for name in ("observation", "motion", "encoding")})
-        for name in settings.knobs:
+        for name in settings.parameters:
             if name in self._rows:
                 self._rows[name].set_value(flat[name])
                 self._rows[name].allow_open(base.value_of(name) is None)

@@ -56,7 +56,7 @@ class CurvePoint:
         Since the run's first step.
     loss : float
         As in `Progress`.
-    sample_error : float or None
+    held_out_rmse : float or None
         As in `Progress`.
     scores : Scores or None
         Where they were taken at this point.
@@ -64,7 +64,7 @@ class CurvePoint:
 
     seconds: float
     loss: float
-    sample_error: float | None
+    held_out_rmse: float | None
     scores: Scores | None
 
 
@@ -163,7 +163,7 @@ class Job:
     def _take(self, report: "Progress") -> None:
         scores = self._score(report)
         self.curve.append(
-            CurvePoint(seconds=report.seconds, loss=report.loss, sample_error=report.sample_error, scores=scores)
+            CurvePoint(seconds=report.seconds, loss=report.loss, held_out_rmse=report.held_out_rmse, scores=scores)
         )
         self.reports.put(report)
         if report.preview is not None:

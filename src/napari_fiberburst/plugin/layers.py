@@ -74,12 +74,12 @@ class RunLayers:
                 self._add_picture(kind, data, placed, self.placement.colormaps[number])
                 self._outlined = time.perf_counter()
             elif self._has(layer):
-                if self._drawn_at is None or not np.array_equal(self._drawn_at, canvas.frame0_from_image):
+                if self._drawn_at is None or not np.array_equal(self._drawn_at, canvas.reference_from_image):
                     for attribute, value in placed.items():
                         setattr(layer, attribute, value)
                 self._fit_contrast(kind, layer, data)
                 layer.data = data
-        self._drawn_at = canvas.frame0_from_image
+        self._drawn_at = canvas.reference_from_image
 
     def show_frames(self, homographies: NDArray[np.float64], shape: tuple[int, int]) -> None:
         """Show, now and then, where each frame (H, W) lies on the picture: outlines, and a track of the centres."""

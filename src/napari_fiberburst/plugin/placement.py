@@ -106,8 +106,8 @@ class Placement:
         """
         step, first = np.ones(2), np.array(self.origin, dtype=np.float64)
         if canvas is not None:
-            step = canvas.frame0_from_image[[1, 0], [1, 0]]
-            first = first + canvas.frame0_from_image[[1, 0], [2, 2]]
+            step = canvas.reference_from_image[[1, 0], [1, 0]]
+            first = first + canvas.reference_from_image[[1, 0], [2, 2]]
         at = [self.axes.index(axis) for axis in axes]
         scale, translate = (np.array(value)[at] for value in (self.scale, self.translate))
         rows_and_columns = [axes.index("Y"), axes.index("X")]

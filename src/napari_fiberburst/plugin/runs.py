@@ -58,7 +58,7 @@ class KeptRun:
     history : History
         The pictures on the way.
     turned_live : list of (float, str, object)
-        Seconds, knob and value of what was changed while it ran, which the call does not hold.
+        Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
         Once it has ended.
     scores : Scores or None

@@ -32,7 +32,7 @@ class Diagnostics:
     residuals : numpy.ndarray or None
         (T, N) float32, root mean square by which the model misses each core in each frame, intensity units; NaN
         where there is no sample.
-    sample_error : float or None
+    held_out_rmse : float or None
         Root mean square by which samples that were left out of the fit are missed, intensity units.
     frames_used : tuple of int or None
         Frames that take part. The others could not be registered; their homographies are NaN.
@@ -52,7 +52,7 @@ class Diagnostics:
     gain_ratios: NDArray[np.float32] | None = None
     gain_weights: NDArray[np.float32] | None = None
     residuals: NDArray[np.float32] | None = None
-    sample_error: float | None = None
+    held_out_rmse: float | None = None
     frames_used: tuple[int, ...] | None = None
     confidence: NDArray[np.float64] | None = None
     reference: int = 0
@@ -63,7 +63,7 @@ class Diagnostics:
         """Return what is not a picture, as plain values that JSON can hold."""
         bundle = self.bundle
         return {
-            "sample_error": self.sample_error,
+            "held_out_rmse": self.held_out_rmse,
             "frames_used": self.frames_used,
             "confidence": None
             if self.confidence is None

@@ -36,7 +36,7 @@ class Progress:
     preview : numpy.ndarray or None
         The picture as of now, in the burst's intensity units, (H, W) or (H, W, C) float32; None where this
         report has none.
-    sample_error : float or None
+    held_out_rmse : float or None
         Root mean square by which samples that were left out of the fit are missed, in the burst's intensity units;
         None while that is not known.
     """
@@ -51,4 +51,4 @@ class Progress:
     settings: Settings
     canvas: Canvas
     preview: NDArray[np.float32] | None = None
-    sample_error: float | None = None
+    held_out_rmse: float | None = None

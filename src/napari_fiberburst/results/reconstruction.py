@@ -84,7 +84,7 @@ class Reconstruction(Diagnostics):
 
     Notes
     -----
-    What the picture rests on (`coverage`, `uncertainty`, `sample_error`, `cores` and more) is described at
+    What the picture rests on (`coverage`, `uncertainty`, `held_out_rmse`, `cores` and more) is described at
     `napari_fiberburst.results.diagnostics.Diagnostics`. "Frame 0" stands for the frame `reference` wherever that is
     another.
     """
@@ -193,7 +193,7 @@ class Reconstruction(Diagnostics):
             "compression": self.compression,
             "canvas": {
                 "shape": self.canvas.shape,
-                "frame0_from_image": self.canvas.frame0_from_image.tolist(),
+                "reference_from_image": self.canvas.reference_from_image.tolist(),
             },
             "burst": self.acquisition.to_dict(),
             "homographies": np.where(

@@ -173,7 +173,7 @@ class NormalEquations:
         """Return the weight of samples per node, (H, W): what the stencil does to an even scene."""
         return self.stencil.row_sums
 
-    def deviation(self, smoothness: float, variance: float, most: float, reach: float) -> Tensor:
+    def posterior_std(self, smoothness: float, variance: float, most: float, reach: float) -> Tensor:
         """Return the posterior's standard deviation of the scene, (H, W), were sampling everywhere as it is nearby.
 
         Where samples of variance `variance` lie with the density c, every frequency f of the scene has the posterior

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, get_args
 
-from napari_fiberburst.settings.parameter import check, knob
+from napari_fiberburst.settings.parameter import check, parameter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,7 +19,7 @@ class NeRF:
     """Sines and cosines at octaves (Mildenhall et al., 2020)."""
 
     name: ClassVar[str] = "nerf"
-    highest_octave: int = knob(
+    highest_octave: int = parameter(
         15, "L of the octaves 2^0 to 2^L; more resolve finer detail, noise and honeycomb.", least=0, most=24
     )
 
@@ -32,8 +32,10 @@ class Fourier:
     """Random Fourier features (Tancik et al., 2020)."""
 
     name: ClassVar[str] = "fourier"
-    features: int = knob(256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1, most=2**16)
-    sigma: float | None = knob(
+    features: int = parameter(
+        256, "Random frequencies; more resolve detail more evenly, at more cost.", least=1, most=2**16
+    )
+    sigma: float | None = parameter(
         None,
         "Frequency spread, cycles per half frame; more resolves finer detail, and noise. None follows the core pitch; "
         "without a bundle model it is 5, as published, and more resolves the honeycomb in the end.",
@@ -50,11 +52,15 @@ class Hash:
     """Multi-resolution hash grid (Müller et al., 2022)."""
 
     name: ClassVar[str] = "hash"
-    levels: int = knob(12, "Grid levels; more resolve finer detail.", least=1, most=24)
-    level_features: int = knob(2, "Learned values per grid point; more can hold more, at more cost.", least=1, most=64)
-    table_bits: int = knob(16, "Binary log of the table length; more means fewer collisions.", least=4, most=24)
-    base_resolution: int = knob(4, "Cells across the frame at the coarsest level.", least=1, most=4096)
-    growth: float = knob(1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1, most=2)
+    levels: int = parameter(12, "Grid levels; more resolve finer detail.", least=1, most=24)
+    level_features: int = parameter(
+        2, "Learned values per grid point; more can hold more, at more cost.", least=1, most=64
+    )
+    table_bits: int = parameter(16, "Binary log of the table length; more means fewer collisions.", least=4, most=24)
+    base_resolution: int = parameter(4, "Cells across the frame at the coarsest level.", least=1, most=4096)
+    growth: float = parameter(
+        1.61, "Ratio of cells from one level to the next; more reaches finer cells.", above=1, most=2
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -65,7 +71,9 @@ class Siren:
     """Sine activations instead of an encoding (Sitzmann et al., 2020)."""
 
     name: ClassVar[str] = "siren"
-    omega_0: float = knob(30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4)
+    omega_0: float = parameter(
+        30.0, "Frequency of the sine activations; more resolves finer detail.", above=0, most=1e4
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -115,8 +123,8 @@ class Homography:
 class _MotionNetwork:
     # Behind a bundle the frames are registered by homographies before the network refines them.
     dof: ClassVar[int] = 8
-    motion_layers: int = knob(3, "Hidden layers of the motion network.", least=1, most=64)
-    motion_width: int = knob(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
+    motion_layers: int = parameter(3, "Hidden layers of the motion network.", least=1, most=64)
+    motion_width: int = parameter(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
 
     def __post_init__(self) -> None:
         check(self)
@@ -134,7 +142,7 @@ class Flow(_MotionNetwork):
     """A displacement per pixel and frame, from a sine network: objects that deform."""
 
     name: ClassVar[str] = "flow"
-    flow_omega_0: float = knob(
+    flow_omega_0: float = parameter(
         30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0, most=1e4
     )
 
@@ -144,7 +152,7 @@ class FlowTV(Flow):
     """Optical flow with total variation: displacements that change little from pixel to pixel."""
 
     name: ClassVar[str] = "flow_tv"
-    tv_weight: float = knob(1.0, "Weight of the flow's total variation; more makes it smoother.", least=0)
+    tv_weight: float = parameter(1.0, "Weight of the flow's total variation; more makes it smoother.", least=0)
 
 
 Encoding = NoEncoding | NeRF | Fourier | Hash | Siren

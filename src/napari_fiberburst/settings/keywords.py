@@ -1,13 +1,13 @@
-"""The keywords that `reconstruct`, the command line and forms take: every knob there is, on one level."""
+"""The keywords that `reconstruct`, the command line and forms take: every parameter there is, on one level."""
 
 from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, HomographyNetwork
 from napari_fiberburst.settings.methods import METHODS, NetworkMethod, PublishedMethod, SplineMethod
-from napari_fiberburst.settings.parameter import Knob, knobs_of
+from napari_fiberburst.settings.parameter import Parameter, parameters_of
 
 # What the keyword `encoding` takes by name: the spline is chosen in the networks' place.
 ENCODING_NAMES = (SplineMethod.name, *ENCODINGS)
 # The keyword `observation` tells a method's `samples`, or that there is no bundle model to take them with.
-OBSERVATION = Knob(
+OBSERVATION = Parameter(
     name="observation",
     kind=str,
     default="auto",
@@ -15,7 +15,7 @@ OBSERVATION = Knob(
     "burst itself shows; frames stands for the published method, which has no bundle model.",
     choices=("auto", "cores", "pixels", "frames"),
 )
-# Knobs that some methods have are told by what the user has chosen to come to those methods.
+# Parameters that some methods have are told by what the user has chosen to come to those methods.
 _METHODS_IN_WORDS = {
     (SplineMethod,): ("encoding", SplineMethod.name),
     (NetworkMethod, PublishedMethod): ("", "networks"),
@@ -23,10 +23,10 @@ _METHODS_IN_WORDS = {
 }
 
 
-def keywords_of(owner: type) -> dict[str, Knob]:
-    """Return the knobs of a method, motion, encoding or of the settings by their keywords."""
-    knobs = {name: knob for name, knob in knobs_of(owner).items() if name != "samples"}
-    return {"observation": OBSERVATION, **knobs} if owner in METHODS.values() else knobs
+def keywords_of(owner: type) -> dict[str, Parameter]:
+    """Return the parameters of a method, motion, encoding or of the settings by their keywords."""
+    parameters = {name: parameter for name, parameter in parameters_of(owner).items() if name != "samples"}
+    return {"observation": OBSERVATION, **parameters} if owner in METHODS.values() else parameters
 
 
 def owners_of(name: str) -> list[tuple[str, str]]:

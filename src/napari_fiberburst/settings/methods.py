@@ -19,7 +19,7 @@ from napari_fiberburst.settings.choices import (
     Motion,
     PublishedMotion,
 )
-from napari_fiberburst.settings.parameter import check, knob
+from napari_fiberburst.settings.parameter import check, parameter
 
 _PUBLISHED_SIGMA = 5.0
 _STEPS = (
@@ -34,23 +34,23 @@ _RATE = "Step size of Adam; more is faster and less stable. None suits the encod
 class _Drawn:
     """What every method lets a user choose of its picture."""
 
-    upsample: float = knob(1.0, "Picture pixels to a frame pixel, along each axis.", above=0, most=16)
+    upsample: float = parameter(1.0, "Picture pixels to a frame pixel, along each axis.", above=0, most=16)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _BehindBundle(_Drawn):
     """What a method with a model of the bundle lets a user choose of it."""
 
-    samples: Literal["auto", "cores", "pixels"] = knob(
+    samples: Literal["auto", "cores", "pixels"] = parameter(
         "auto",
         "What is taken as one sample behind the bundle: each core, each lit pixel, or, auto, what the burst itself "
         "shows.",
     )
-    canvas: Literal["frame", "union"] = knob(
+    canvas: Literal["frame", "union"] = parameter(
         "frame", "What the picture covers: the first frame's field, or all that any frame saw."
     )
-    fill: bool = knob(False, "Fill in the picture where no core has looked, instead of leaving it empty (NaN).")
-    held_out: float = knob(
+    fill: bool = parameter(False, "Fill in the picture where no core has looked, instead of leaving it empty (NaN).")
+    held_out: float = parameter(
         0.05, "Part of the samples that is left out of the fit and tells how well it predicts.", least=0, most=0.5
     )
 
@@ -59,11 +59,13 @@ class _BehindBundle(_Drawn):
 class _SceneNetwork(_Drawn):
     """The size of the scene network, and how it is trained."""
 
-    scene_layers: int = knob(4, "Hidden layers of the scene network.", least=1, most=64)
-    scene_width: int = knob(
+    scene_layers: int = parameter(4, "Hidden layers of the scene network.", least=1, most=64)
+    scene_width: int = parameter(
         256, "Units per hidden layer of the scene network; more holds more detail.", least=1, most=2**14
     )
-    batch: int | None = knob(None, "Samples per step; None takes an eighth of a frame's pixels, as published.", least=1)
+    batch: int | None = parameter(
+        None, "Samples per step; None takes an eighth of a frame's pixels, as published.", least=1
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,19 +79,19 @@ class SplineMethod(_BehindBundle):
 
     Notes
     -----
-    The other attributes are knobs; `napari_fiberburst.settings.parameter.knobs_of` lists them with text and range.
+    The other attributes are parameters; `napari_fiberburst.settings.parameter.parameters_of` lists them.
     """
 
     name: ClassVar[str] = "spline"
     motions: ClassVar[Mapping[str, type[Motion]]] = MOTIONS
     motion: FrameMotion = field(default_factory=Homography)
-    smoothness: float | None = knob(
+    smoothness: float | None = parameter(
         None,
         "Weight of the smoothness prior; more is smoother and less noisy. None lets two halves of the burst choose.",
         above=0,
         most=1e6,
     )
-    iterations: int | None = knob(None, _STEPS, least=1)
+    iterations: int | None = parameter(None, _STEPS, least=1)
 
     def __post_init__(self) -> None:
         if isinstance(self.motion, Flow):
@@ -113,15 +115,15 @@ class NetworkMethod(_BehindBundle, _SceneNetwork):
 
     Notes
     -----
-    The other attributes are knobs; `napari_fiberburst.settings.parameter.knobs_of` lists them with text and range.
+    The other attributes are parameters; `napari_fiberburst.settings.parameter.parameters_of` lists them.
     """
 
     name: ClassVar[str] = "network"
     motions: ClassVar[Mapping[str, type[Motion]]] = MOTIONS
     motion: FrameMotion | Flow | FlowTV = field(default_factory=Homography)
     encoding: Encoding = field(default_factory=Fourier)
-    iterations: int | None = knob(None, _STEPS, least=1)
-    learning_rate: float | None = knob(None, _RATE, above=0, most=1e6)
+    iterations: int | None = parameter(None, _STEPS, least=1)
+    learning_rate: float | None = parameter(None, _RATE, above=0, most=1e6)
 
     def __post_init__(self) -> None:
         _check_part("motion", self.motion, self.motions)
@@ -154,15 +156,15 @@ class PublishedMethod(_SceneNetwork):
 
     Notes
     -----
-    The other attributes are knobs; `napari_fiberburst.settings.parameter.knobs_of` lists them with text and range.
+    The other attributes are parameters; `napari_fiberburst.settings.parameter.parameters_of` lists them.
     """
 
     name: ClassVar[str] = "published"
     motions: ClassVar[Mapping[str, type[Motion]]] = PUBLISHED_MOTIONS
     motion: PublishedMotion = field(default_factory=HomographyNetwork)
     encoding: Encoding = field(default_factory=Fourier)
-    iterations: int = knob(3000, _STEPS, least=1)
-    learning_rate: float = knob(1e-4, _RATE, above=0, most=1e6)
+    iterations: int = parameter(3000, _STEPS, least=1)
+    learning_rate: float = parameter(1e-4, _RATE, above=0, most=1e6)
 
     def __post_init__(self) -> None:
         _check_part("motion", self.motion, self.motions)

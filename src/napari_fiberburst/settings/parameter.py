@@ -1,4 +1,4 @@
-"""Knobs: dataclass fields that carry their own range and their own words.
+"""Parameters: dataclass fields that carry their own range and their own words.
 
 A setting is described once, where it is declared. The reader of the code, ``--help`` and a form's tooltip all
 show that text, and every settings object refuses values out of range by the same rule.
@@ -15,7 +15,7 @@ from napari_fiberburst.errors import SettingsError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Knob:
+class Parameter:
     """One setting as a form or a command line needs it.
 
     Attributes
@@ -89,7 +89,7 @@ class Knob:
             raise SettingsError(f"{self.name} must be {self.expected}; got {value!r}")
 
 
-def knob(
+def parameter(
     default: Any,
     doc: str,
     *,
@@ -116,8 +116,8 @@ def knob(
     return field(default=default, metadata={"doc": doc, "least": least, "above": above, "most": most})
 
 
-def knobs_of(settings_type: type) -> dict[str, Knob]:
-    """Return the knobs of a settings class by name, in the order they are declared."""
+def parameters_of(settings_type: type) -> dict[str, Parameter]:
+    """Return the parameters of a settings class by name, in the order they are declared."""
     hints = get_type_hints(settings_type)
     return {item.name: _read(item, hints[item.name]) for item in _declared(settings_type)}
 
@@ -132,22 +132,22 @@ def check(settings: object) -> None:
     SettingsError
         Names the setting, what it may be and what came.
     """
-    for name, knob in knobs_of(type(settings)).items():
+    for name, parameter in parameters_of(type(settings)).items():
         value = getattr(settings, name)
-        knob.check(value)
+        parameter.check(value)
         if value is not None:
-            object.__setattr__(settings, name, knob.kind(value))  # of a frozen dataclass, while it is made
+            object.__setattr__(settings, name, parameter.kind(value))  # of a frozen dataclass, while it is made
 
 
 def _declared(settings_type: type) -> Iterator[Field[Any]]:
     return (item for item in fields(settings_type) if "doc" in item.metadata)
 
 
-def _read(item: Field[Any], hint: Any) -> Knob:
+def _read(item: Field[Any], hint: Any) -> Parameter:
     options = get_args(hint) if isinstance(hint, UnionType) else (hint,)
     (kind,) = [option for option in options if option is not NoneType]
     choices = get_args(kind) if get_origin(kind) is Literal else ()
-    return Knob(
+    return Parameter(
         name=item.name,
         kind=str if choices else kind,
         default=item.default,

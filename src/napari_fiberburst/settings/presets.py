@@ -8,7 +8,7 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, PUBLISHED_MOTIONS
 from napari_fiberburst.settings.keywords import ENCODING_NAMES, keywords_of
 from napari_fiberburst.settings.methods import METHODS, Method, NetworkMethod, PublishedMethod, SplineMethod
-from napari_fiberburst.settings.parameter import Knob, knobs_of
+from napari_fiberburst.settings.parameter import Parameter, parameters_of
 from napari_fiberburst.settings.settings import Settings, known_name, misplaced
 
 PRESETS: Mapping[str, Settings] = {"auto": Settings(), "paper": Settings(method=PublishedMethod())}
@@ -23,9 +23,9 @@ def choose(preset: str | Settings = "auto", **choices: Any) -> Settings:
         Name of the preset to start from, or settings that take its place.
     **choices
         ``motion`` by name or as a settings object; ``encoding`` by name, "spline" among them, or as a settings object;
-        ``observation``; any knob of the method, motion or encoding chosen, or of `Settings`, by name. None leaves the
-        preset's value. ``encoding="spline"`` chooses `SplineMethod`, ``observation="frames"`` `PublishedMethod`, and
-        any other encoding `NetworkMethod`.
+        ``observation``; any parameter of the method, motion or encoding chosen, or of `Settings`, by name. None leaves
+        the preset's value. ``encoding="spline"`` chooses `SplineMethod`, ``observation="frames"`` `PublishedMethod`,
+        and any other encoding `NetworkMethod`.
 
     Raises
     ------
@@ -58,13 +58,13 @@ def choose(preset: str | Settings = "auto", **choices: Any) -> Settings:
     return chosen
 
 
-def all_keywords() -> dict[str, Knob]:
-    """Return every knob there is by its keyword."""
-    found: dict[str, Knob] = {}
+def all_keywords() -> dict[str, Parameter]:
+    """Return every parameter there is by its keyword."""
+    found: dict[str, Parameter] = {}
     for owner in (*METHODS.values(), Settings, *MOTIONS.values(), *PUBLISHED_MOTIONS.values(), *ENCODINGS.values()):
-        for name, knob in keywords_of(owner).items():
+        for name, parameter in keywords_of(owner).items():
             # The first method leaves open what the published one has fixed: the keyword may be None.
-            found.setdefault(name, knob)
+            found.setdefault(name, parameter)
     return found
 
 
@@ -107,5 +107,5 @@ def _part(what: str, value: Any, preset: Any, known: Mapping[str, type], names: 
 
 
 def _turned(part: Any, given: dict[str, Any]) -> Any:
-    """Return a settings object with the values given for its knobs, which are taken out of what is given."""
-    return replace(part, **{name: given.pop(name) for name in knobs_of(type(part)) if name in given})
+    """Return a settings object with the values given for its parameters, which are taken out of what is given."""
+    return replace(part, **{name: given.pop(name) for name in parameters_of(type(part)) if name in given})

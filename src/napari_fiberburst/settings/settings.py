@@ -8,7 +8,7 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.settings.choices import ENCODINGS, Motion
 from napari_fiberburst.settings.keywords import keywords_of, owners_of
 from napari_fiberburst.settings.methods import METHODS, Method, NetworkMethod, PublishedMethod, SplineMethod
-from napari_fiberburst.settings.parameter import Knob, check, knob, knobs_of
+from napari_fiberburst.settings.parameter import Parameter, check, parameter, parameters_of
 
 Chosen = TypeVar("Chosen")
 # None is a choice there, not an open question: no limit, and no previews.
@@ -26,18 +26,19 @@ class Settings:
 
     Notes
     -----
-    The other attributes are knobs; `napari_fiberburst.settings.parameter.knobs_of` lists them with their text and
-    range.
+    The other attributes are parameters; `napari_fiberburst.settings.parameter.parameters_of` lists them.
     The defaults are the preset "auto"; what is None or "auto" there is chosen from the burst.
     """
 
     method: Method = field(default_factory=SplineMethod)
-    seed: int = knob(0, "Seed of everything random; the same seed gives the same picture.", least=0, most=2**31 - 1)
-    device: str = knob("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
-    time_budget: float | None = knob(
+    seed: int = parameter(
+        0, "Seed of everything random; the same seed gives the same picture.", least=0, most=2**31 - 1
+    )
+    device: str = parameter("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
+    time_budget: float | None = parameter(
         None, "Seconds after which to stop with what there is; None for no limit.", above=0
     )
-    preview_every: float | None = knob(
+    preview_every: float | None = parameter(
         None,
         "Seconds between preview pictures while fitting, or more where drawing would slow the fit; None makes none.",
         above=0,
@@ -55,9 +56,9 @@ class Settings:
         return self.method.motions
 
     @property
-    def knobs(self) -> dict[str, Knob]:
-        """The knobs that turn something with the method chosen, by their keywords."""
-        return {name: knob for part in self._parts() for name, knob in keywords_of(type(part)).items()}
+    def parameters(self) -> dict[str, Parameter]:
+        """The parameters that turn something with the method chosen, by their keywords."""
+        return {name: parameter for part in self._parts() for name, parameter in keywords_of(type(part)).items()}
 
     @property
     def left_open(self) -> tuple[str, ...]:
@@ -68,20 +69,20 @@ class Settings:
 
     def flat(self) -> dict[str, Any]:
         """Return the settings as the keywords that `choose` and `napari_fiberburst.reconstruct` take."""
-        turned = {name: getattr(part, name) for part in self._parts() for name in knobs_of(type(part))}
+        turned = {name: getattr(part, name) for part in self._parts() for name in parameters_of(type(part))}
         observation = turned.pop("samples", "frames")
         encoding = self.method.name if isinstance(self.method, SplineMethod) else self.method.encoding.name
         return {"motion": self.method.motion.name, "encoding": encoding, "observation": observation, **turned}
 
     def value_of(self, name: str) -> Any:
-        """Return what a knob is turned to, be it of the motion, the encoding, the method or the rest.
+        """Return what a parameter is turned to, be it of the motion, the encoding, the method or the rest.
 
         Raises
         ------
         SettingsError
-            There is no such knob with the method chosen.
+            There is no such parameter with the method chosen.
         """
-        if name not in self.knobs:
+        if name not in self.parameters:
             raise misplaced(name, self)
         return self.flat()[name]
 
@@ -109,7 +110,7 @@ class Settings:
         return _built(cls, {**values, "method": _built(kind, method)})
 
     def _parts(self) -> tuple[object, ...]:
-        """Return the dataclasses that hold the knobs."""
+        """Return the dataclasses that hold the parameters."""
         parts = (getattr(self.method, part, None) for part in ("motion", "encoding"))
         return (*(part for part in parts if part is not None), self.method, self)
 
@@ -171,7 +172,7 @@ def _built(kind: type[Chosen], values: Mapping[str, Any]) -> Chosen:
 def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Return what version 0.1.0 wrote as it is written now.
 
-    There, all knobs stood on one level, those of other methods too, and motion and encoding, the spline among the
+    There, all parameters stood on one level, those of other methods too, and motion and encoding, the spline among the
     encodings, beside them.
     """
     motion, encoding = (_mapping(part, flat.get(part)) for part in ("motion", "encoding"))

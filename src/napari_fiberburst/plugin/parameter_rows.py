@@ -1,4 +1,4 @@
-"""One row of a form for each knob. magicgui makes the editor from the knob's kind, range and choices."""
+"""One row of a form for each parameter. magicgui makes the editor from the parameter's kind, range and choices."""
 
 import sys
 from typing import Any
@@ -10,12 +10,12 @@ from qtpy.QtCore import Signal
 from qtpy.QtGui import QValidator
 from qtpy.QtWidgets import QAbstractSpinBox, QCheckBox, QDoubleSpinBox, QHBoxLayout, QWidget
 
-from napari_fiberburst.settings.parameter import Knob
+from napari_fiberburst.settings.parameter import Parameter
 
 # A bound for numbers that have none, and the least number that counts as above 0.
 _LARGEST_FLOAT, _LARGEST_INTEGER, _LEAST_ABOVE_ZERO = sys.float_info.max, 2**63 - 1, 1e-12
 _NARROWEST = 70
-# What an open knob shows before a run has chosen.
+# What an open parameter shows before a run has chosen.
 _START = {"iterations": 1000, "time_budget": 60, "sigma": 5, "learning_rate": 1e-3, "batch": 8192, "smoothness": 0.01}
 
 
@@ -60,26 +60,26 @@ class NumberEditor(RangedWidget[float]):
         super().__init__(**{**options, "widget_type": _NumberBackend})
 
 
-class KnobRow(QWidget):
-    """The editor for one knob. Where the knob may be left open, a box "auto" says what was chosen.
+class ParameterRow(QWidget):
+    """The editor for one parameter. Where the parameter may be left open, a box "auto" says what was chosen.
 
     Attributes
     ----------
-    knob : Knob
+    parameter : Parameter
         What it stands for.
     editor : magicgui.widgets.bases.ValueWidget
         Shows and changes the value.
     auto : QCheckBox or None
-        Checked where the knob is left open; None where it cannot be.
+        Checked where the parameter is left open; None where it cannot be.
     """
 
     changed = Signal()
 
-    def __init__(self, knob: Knob, parent: QWidget | None = None) -> None:
+    def __init__(self, parameter: Parameter, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self.knob = knob
-        self.editor = _editor(knob)
-        self.auto = QCheckBox("auto") if knob.optional else None
+        self.parameter = parameter
+        self.editor = _editor(parameter)
+        self.auto = QCheckBox("auto") if parameter.optional else None
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
         row.addWidget(self.editor.native, 1)
@@ -88,22 +88,22 @@ class KnobRow(QWidget):
             self.auto.setToolTip(f"Leave {self.label} open.")
             self.auto.toggled.connect(self._follow_auto)
         for part in (self, self.editor.native):
-            part.setToolTip(f"{knob.doc}\n({knob.name}: {knob.expected})")
-        self.set_value(knob.default)
+            part.setToolTip(f"{parameter.doc}\n({parameter.name}: {parameter.expected})")
+        self.set_value(parameter.default)
         self.editor.changed.connect(lambda _: self.changed.emit())
 
     @property
     def label(self) -> str:
-        """The knob's name in words."""
-        return self.knob.name.replace("_", " ")
+        """The parameter's name in words."""
+        return self.parameter.name.replace("_", " ")
 
     @property
     def value(self) -> Any:
-        """The knob's value; None where it is left open."""
+        """The parameter's value; None where it is left open."""
         return None if self.auto is not None and self.auto.isChecked() else self.editor.value
 
     def set_value(self, value: Any) -> None:
-        """Turn the knob, without a signal."""
+        """Turn the parameter, without a signal."""
         if self.auto is not None:
             self.auto.blockSignals(True)
             self.auto.setChecked(value is None)
@@ -114,12 +114,12 @@ class KnobRow(QWidget):
             self._show(value)
 
     def allow_open(self, is_allowed: bool) -> None:
-        """Offer to leave the knob open, or not where the preset has a value of its own."""
+        """Offer to leave the parameter open, or not where the preset has a value of its own."""
         if self.auto is not None:
             self.auto.setVisible(is_allowed)
 
     def show_chosen(self, value: Any) -> None:
-        """Say which value a run has chosen for an open knob."""
+        """Say which value a run has chosen for an open parameter."""
         if self.auto is None or not self.auto.isChecked():
             return
         number = f"{value:.3g}" if isinstance(value, float) else f"{value}"
@@ -140,19 +140,19 @@ class KnobRow(QWidget):
         self.changed.emit()
 
 
-def _editor(knob: Knob) -> ValueWidget[Any]:
-    """Return an editor for the values that a knob allows, None left out: magicgui's ranged widgets know no None."""
-    if knob.choices:
-        editor = create_widget(widget_type="ComboBox", options={"choices": knob.choices})
-    elif knob.kind in (int, float):
-        start = _START.get(knob.name, 1) if knob.default is None else knob.default
+def _editor(parameter: Parameter) -> ValueWidget[Any]:
+    """Return an editor for what a parameter allows but None, which magicgui's ranged widgets do not take."""
+    if parameter.choices:
+        editor = create_widget(widget_type="ComboBox", options={"choices": parameter.choices})
+    elif parameter.kind in (int, float):
+        start = _START.get(parameter.name, 1) if parameter.default is None else parameter.default
         editor = create_widget(
             start,
-            widget_type=NumberEditor if knob.kind is float else "SpinBox",  # type: ignore[arg-type]
-            options=_range(knob),
+            widget_type=NumberEditor if parameter.kind is float else "SpinBox",  # type: ignore[arg-type]
+            options=_range(parameter),
         )
     else:
-        editor = create_widget(annotation=knob.kind)
+        editor = create_widget(annotation=parameter.kind)
     assert isinstance(editor, ValueWidget)
     if isinstance(editor.native, QAbstractSpinBox):
         editor.native.setKeyboardTracking(False)
@@ -161,10 +161,10 @@ def _editor(knob: Knob) -> ValueWidget[Any]:
     return editor
 
 
-def _range(knob: Knob) -> dict[str, float]:
+def _range(parameter: Parameter) -> dict[str, float]:
     """Return magicgui's inclusive bounds of a number."""
-    largest = _LARGEST_INTEGER if knob.kind is int else _LARGEST_FLOAT
-    least = knob.least if knob.least is not None else knob.above
-    if least == 0 and knob.above is not None:
+    largest = _LARGEST_INTEGER if parameter.kind is int else _LARGEST_FLOAT
+    least = parameter.least if parameter.least is not None else parameter.above
+    if least == 0 and parameter.above is not None:
         least = _LEAST_ABOVE_ZERO
-    return {"min": -largest if least is None else least, "max": largest if knob.most is None else knob.most}
+    return {"min": -largest if least is None else least, "max": largest if parameter.most is None else parameter.most}
