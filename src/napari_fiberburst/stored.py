@@ -18,7 +18,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import FiberBurstError, OutputError
-from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.io.results import check_place, write_whole
 
 Arrays = dict[str, NDArray[Any]]
 _VERSION = 1
@@ -48,9 +48,7 @@ class Stored:
         OutputError
             The folder does not exist or cannot be written, or the name has another ending.
         """
-        target = Path(path)
-        if not target.name.lower().endswith(self._ending):
-            raise OutputError(f"a {self._kind} is written to a file ending in {self._ending}; got {path}")
+        target = self.check_output(path)
         arrays: Arrays = {}
         document = json.dumps(_flattened(self, "", arrays), allow_nan=True, sort_keys=True)
         metadata = {
@@ -61,6 +59,21 @@ class Stored:
         }
         with write_whole(target) as stream:
             stream.write(safetensors.numpy.save(arrays, metadata))
+        return target
+
+    @classmethod
+    def check_output(cls, path: str | Path) -> Path:
+        """Refuse a path that no such value can be saved to; before long work rather than after it.
+
+        Raises
+        ------
+        OutputError
+            The folder does not exist or cannot be written, or the name has another ending.
+        """
+        target = Path(path)
+        if not target.name.lower().endswith(cls._ending):
+            raise OutputError(f"a {cls._kind} is written to a file ending in {cls._ending}; got {path}")
+        check_place(target)
         return target
 
     @classmethod

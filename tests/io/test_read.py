@@ -248,7 +248,56 @@ def test_levels_are_handed_on(tmp_path, frames):
     assert (burst.black_level, burst.white_level) == (3, 200)
 
 
-@pytest.mark.parametrize("kind", ["plain", "ome", "imagej", "compressed", "single pages", "bigtiff"])
+@pytest.mark.parametrize("compression", ["lzw", "zlib", "deflate", "zstd", "packbits", "lzma"])
+@pytest.mark.parametrize("predictor", [False, True])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_compressed_tiff_is_read_exactly(tmp_path, frames, compression, predictor, dtype):
+    pixels = frames.astype(dtype) * (257 if dtype == np.uint16 else 1)
+    if compression == "packbits" and predictor:
+        pixels, predictor = pixels[:, ::-1].copy(), False  # it knows no predictor
+    tifffile.imwrite(
+        tmp_path / "burst.tif", pixels, photometric="minisblack", compression=compression, predictor=predictor
+    )
+    assert_holds(read_burst(tmp_path / "burst.tif"), pixels)
+
+
+@pytest.mark.parametrize("imagej_like", [{"metadata": {"axes": "TYX"}}, {"rowsperstrip": 3}, {"tile": (16, 16)}])
+def test_lzw_as_microscopes_write_it_is_read(tmp_path, frames, imagej_like):
+    tifffile.imwrite(tmp_path / "burst.tif", frames, photometric="minisblack", compression="lzw", **imagej_like)
+    assert_holds(read_burst(tmp_path / "burst.tif"), frames)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_jpeg_compressed_tiff_is_read_to_within_its_loss(tmp_path, channels):
+    y, x = np.indices((37, 31))
+    smooth = 120 + 60 * np.sin(x / 9) * np.cos(y / 11)
+    pixels = np.stack([smooth + 5 * number for number in range(3)]).astype(np.uint8)
+    if channels == 3:
+        pixels = np.stack([pixels, pixels // 2, pixels // 3], axis=-1)
+    kind = "minisblack" if channels == 1 else "rgb"
+    tifffile.imwrite(
+        tmp_path / "burst.tif", pixels, photometric=kind, compression="jpeg", compressionargs={"level": 95}
+    )
+    burst = read_burst(tmp_path / "burst.tif")
+    assert burst.shape == (3, 37, 31, channels)
+    read = burst.frames * (burst.white_level - burst.black_level) + burst.black_level
+    assert np.abs(read - pixels.reshape(burst.shape)).max() < 12
+
+
+@pytest.mark.parametrize("compression", ["lzw", "zstd", "jpeg"])
+def test_a_damaged_compressed_tiff_is_refused(tmp_path, frames, compression):
+    path = tmp_path / "burst.tif"
+    tifffile.imwrite(path, frames, photometric="minisblack", compression=compression)
+    with tifffile.TiffFile(path) as file:
+        start, length = file.pages[1].dataoffsets[0], file.pages[1].databytecounts[0]
+    data = bytearray(path.read_bytes())
+    data[start : start + length] = b"\x5a" * length
+    path.write_bytes(data)
+    with pytest.raises(BurstError, match=r"cannot be read as TIFF.*copy or export it again"):
+        read_burst(path)
+
+
+@pytest.mark.parametrize("kind", ["plain", "ome", "imagej", "compressed", "lzw", "single pages", "bigtiff"])
 def test_a_tiff_cut_anywhere_is_refused_or_whole(tmp_path, frames, kind):
     whole = tmp_path / "whole.tif"
     if kind == "single pages":
@@ -260,6 +309,7 @@ def test_a_tiff_cut_anywhere_is_refused_or_whole(tmp_path, frames, kind):
             "ome": {"ome": True},
             "imagej": {"imagej": True},
             "compressed": {"compression": "zlib"},
+            "lzw": {"compression": "lzw"},
             "bigtiff": {"bigtiff": True},
         }.get(kind, {})
         tifffile.imwrite(whole, frames, photometric="minisblack", **choices)

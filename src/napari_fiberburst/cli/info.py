@@ -1,24 +1,45 @@
 """``fiberburst info``."""
 
 import argparse
+from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from PIL import Image
+
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io import read_burst
+from napari_fiberburst.io.results import check_place, write_whole
+
+if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
 
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
     parser: argparse.ArgumentParser = commands.add_parser(
-        "info", help="say what a burst holds", description="Open a burst and say what is known of it."
+        "info",
+        help="say what a burst or a bundle holds",
+        description="Open a burst, or a bundle that was kept, and say what is known of it.",
     )
-    parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, or OME-Zarr")
+    parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, OME-Zarr; or probe.bundle")
+    parser.add_argument("-o", "--output", type=Path, help="draw the bundle as a picture into this file, a .png")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Read and print."""
+    is_bundle = options.input.suffix.lower() == ".bundle"
+    if options.output is not None:
+        if not is_bundle:
+            raise OutputError(f"only a bundle is drawn, a file ending in .bundle; got {options.input}; leave -o out")
+        if options.output.suffix.lower() != ".png":
+            raise OutputError(f"a bundle is drawn as a .png file; got {options.output}")
+        check_place(options.output)
+    if is_bundle:
+        return _of_bundle(options.input, options.output)
     burst = read_burst(options.input, axes=options.axes)
     count, height, width, channels = burst.shape
     size = "unknown"
@@ -36,4 +57,43 @@ def run(options: argparse.Namespace) -> int:
         ("times", times),
     ):
         print(f"{name:15} {value}")
+    return 0
+
+
+def describe(bundle: "Bundle") -> None:
+    """Print what a bundle has."""
+    height, width = bundle.shape
+    told = bundle.provenance
+    gains = "unknown" if not bundle.gains_known else f"known by {np.median(bundle.gain_weights):.2g} bright exposures"
+    places = {"cores": "cores", "unresolved": "blocks of pixels, because cores cannot be told apart"}
+    rows: tuple[tuple[str, object], ...] = (
+        ("height x width", f"{height} x {width}"),
+        (places.get(bundle.pattern, "blocks of pixels"), len(bundle.centres)),
+        ("pitch", f"{bundle.pitch:.2f} pixels"),
+        ("footprint", f"{bundle.radius:.2f} pixels radius"),
+        ("field", f"{bundle.outline.mean():.0%} of the frame"),
+        ("dead", len(bundle.dead)),
+        ("saturated", int(bundle.saturated.sum())),
+        ("black", f"{bundle.black:g}"),
+        ("offsets", f"up to {bundle.offsets.max():.3g}" if bundle.offsets.any() else "none"),
+        ("channels", bundle.gains.shape[1] if bundle.gains.shape[1] > 1 else "alike"),
+        ("gains", f"{gains}, {told.get('bursts', 0)} bursts"),
+        ("from", ", ".join([told.get("source", "unknown"), *told.get("files", [])])),
+        ("on", f"{told.get('date', 'unknown')}, version {told.get('version', 'unknown')}"),
+    )
+    for name, value in rows:
+        print(f"{name:15} {value}")
+
+
+def _of_bundle(path: Path, output: Path | None) -> int:
+    from napari_fiberburst.bundle.bundle import Bundle  # torch takes seconds to load
+
+    bundle = Bundle.load(path)
+    describe(bundle)
+    if output is not None:
+        encoded = BytesIO()
+        Image.fromarray(bundle.picture()).save(encoded, format="PNG")
+        with write_whole(output) as stream:
+            stream.write(encoded.getvalue())
+        print(f"wrote {output}")
     return 0

@@ -7,15 +7,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from napari_fiberburst.cli.arguments import add_settings, parse_crop, settings_of
 from napari_fiberburst.control import Control
+from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.results import check_output
-from napari_fiberburst.settings import choose
+from napari_fiberburst.settings import Settings, choose
+
+if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
+    from napari_fiberburst.results.reconstruction import Reconstruction
 
 INTERRUPTED = 130
 
@@ -39,7 +44,13 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.add_argument("--black-level", type=float, help="intensity that stands for no light")
     parser.add_argument(
-        "--calibration", type=Path, help="picture of the bundle with nothing but even light before it; never needed"
+        "--bundle",
+        type=Path,
+        help="probe.bundle, or a picture of the bundle in even light; with it one frame is a burst",
+    )
+    parser.add_argument("--calibration", type=Path, help="short for --bundle with a picture")
+    parser.add_argument(
+        "--keep-bundle", type=Path, help="write the bundle here, with what this burst has told of it; a .bundle file"
     )
     parser.add_argument("--white-level", type=float, help="intensity that stands for full scale")
     add_settings(parser)
@@ -51,6 +62,9 @@ def run(options: argparse.Namespace) -> int:
     check_output(options.output, options.input)
     choices = settings_of(options)
     settings = choose(**choices)
+    _check(options, settings)
+    given = options.bundle if options.bundle is not None else options.calibration
+    known = None if given is None else _opened(given)
     burst = read_burst(
         options.input, axes=options.axes, black_level=options.black_level, white_level=options.white_level
     )
@@ -69,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
             bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
             bar.update(report.step - bar.n)
 
-        result = reconstruct(burst, **choices, calibration=options.calibration, control=control, on_progress=show)
+        result = reconstruct(burst, **choices, bundle=known, control=control, on_progress=show)
         result.save(options.output)
     steps = len(result.losses)
     rate = steps / result.seconds
@@ -83,7 +97,39 @@ def run(options: argparse.Namespace) -> int:
     if result.compression > 0:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     print(f"wrote {options.output}")
+    if options.keep_bundle is not None:
+        _keep(options.keep_bundle, result, known)
     return INTERRUPTED if result.ending == "stopped" else 0
+
+
+def _check(options: argparse.Namespace, settings: Settings) -> None:
+    """Refuse what cannot be done with bundles, before anything is read."""
+    given = [name for name in ("bundle", "calibration", "keep_bundle") if getattr(options, name) is not None]
+    if given[:2] == ["bundle", "calibration"]:
+        raise SettingsError("--calibration is short for --bundle with a picture; give one of the two")
+    if given and settings.is_published:
+        raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
+    if options.keep_bundle is not None:
+        from napari_fiberburst.bundle.bundle import Bundle
+
+        Bundle.check_output(options.keep_bundle)
+
+
+def _opened(path: Path) -> "Bundle":
+    from napari_fiberburst.pipeline.reconstruct import as_bundle
+
+    return as_bundle(path)
+
+
+def _keep(path: Path, result: "Reconstruction", known: "Bundle | None") -> None:
+    """Write the bundle that was given, made better; or the one that was found."""
+    found = result.bundle
+    if result.ending == "stopped" or found is None or not found.gains_known or found.pattern == "none":
+        print(f"fiberburst: the run has not measured the bundle; {path} was not written", file=sys.stderr)
+        return
+    bundle = found if known is None else known.updated(result)
+    bundle.save(path)
+    print(f"wrote {path}")
 
 
 @contextmanager
