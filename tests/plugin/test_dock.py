@@ -152,7 +152,7 @@ def test_the_form_is_as_it_was_left(open_dock, burst_layer):
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
-    assert len(run.history.snapshots) >= 2
+    assert len(run.history.entries) >= 2
     final = viewer.layers["run 1: picture"].data.copy()
     dock.display.slider.setValue(0)
     early = viewer.layers["run 1: picture"].data

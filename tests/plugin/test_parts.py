@@ -14,7 +14,7 @@ from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
 from napari_fiberburst.plugin.calls import as_command, as_python
 from napari_fiberburst.plugin.drivers import without_clash
-from napari_fiberburst.plugin.history import History, Snapshot
+from napari_fiberburst.plugin.history import History, HistoryEntry
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
 from napari_fiberburst.results.reconstruction import Canvas
@@ -123,9 +123,9 @@ def test_history_keeps_the_first_the_newest_and_an_even_part_between():
     canvas = Canvas.over((0, 0, 10, 10))
     history = History(most_bytes=10 * 400)
     for number in range(100):
-        history.add(Snapshot(float(number), np.full((10, 10), number, np.float32), canvas))
-        assert history.snapshots[-1].seconds == number
-    seconds = [snapshot.seconds for snapshot in history.snapshots]
+        history.add(HistoryEntry(float(number), np.full((10, 10), number, np.float32), canvas))
+        assert history.entries[-1].seconds == number
+    seconds = [entry.seconds for entry in history.entries]
     assert len(seconds) <= 10
     assert seconds[0] == 0
     assert len(set(np.diff(seconds[:-1]))) == 1

@@ -12,7 +12,7 @@ from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidg
 from superqt import QLabeledSlider
 
 from napari_fiberburst.plugin.curves import Curves
-from napari_fiberburst.plugin.history import Snapshot
+from napari_fiberburst.plugin.history import HistoryEntry
 from napari_fiberburst.plugin.job import Job
 from napari_fiberburst.plugin.runs import KeptRun
 from napari_fiberburst.plugin.sections import section
@@ -69,7 +69,7 @@ class Display(QObject):
     def preview(self, run: KeptRun, job: Job, report: "Progress") -> None:
         """Show the picture that a running fit has come to, and keep it."""
         if report.preview is not None and job.acquisition is not None:
-            run.history.add(Snapshot(report.seconds, report.preview, report.canvas))
+            run.history.add(HistoryEntry(report.seconds, report.preview, report.canvas))
             run.layers.show_picture(report.preview, job.acquisition, report.canvas)
             if run is self._selected:
                 self.select(run)
@@ -114,7 +114,7 @@ class Display(QObject):
             before.layers.show_picture(result.image, result.acquisition, result.canvas)
         self._selected = run
         self.slider.blockSignals(True)
-        self.slider.setMaximum(0 if run is None else max(0, len(run.history.snapshots) - 1))
+        self.slider.setMaximum(0 if run is None else max(0, len(run.history.entries) - 1))
         self.slider.setValue(self.slider.maximum())
         self.slider.blockSignals(False)
 
@@ -160,9 +160,9 @@ class Display(QObject):
     def _scrub(self, index: int) -> None:
         """Show a picture of the past."""
         run = self._selected
-        if run is not None and run.result is not None and index < len(run.history.snapshots):
-            snapshot = run.history.snapshots[index]
-            run.layers.show_picture(snapshot.picture, run.result.acquisition, snapshot.canvas)
+        if run is not None and run.result is not None and index < len(run.history.entries):
+            entry = run.history.entries[index]
+            run.layers.show_picture(entry.picture, run.result.acquisition, entry.canvas)
 
 
 class AnimationThrottle:

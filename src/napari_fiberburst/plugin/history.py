@@ -11,7 +11,7 @@ _MOST_BYTES = 128 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class Snapshot:
+class HistoryEntry:
     """The picture of a run at one time.
 
     Attributes
@@ -41,18 +41,18 @@ class History:
     def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
         self._most = most_bytes
         self._every, self._offered = 1, 0
-        self._kept: list[tuple[int, Snapshot]] = []
+        self._kept: list[tuple[int, HistoryEntry]] = []
 
     @property
-    def snapshots(self) -> list[Snapshot]:
+    def entries(self) -> list[HistoryEntry]:
         """The pictures kept, oldest first."""
-        return [snapshot for _, snapshot in self._kept]
+        return [entry for _, entry in self._kept]
 
-    def add(self, snapshot: Snapshot) -> None:
+    def add(self, entry: HistoryEntry) -> None:
         """Keep a picture; where memory is full, every second one is let go, now and from now on."""
         if self._kept and self._kept[-1][0] % self._every:
             self._kept.pop()  # it was there as the newest alone
-        self._kept.append((self._offered, snapshot))
+        self._kept.append((self._offered, entry))
         self._offered += 1
         while len(self._kept) > 2 and sum(kept.picture.nbytes for _, kept in self._kept) > self._most:
             self._every *= 2
