@@ -16,7 +16,7 @@ from napari_fiberburst.control import Control
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.results import check_output
-from napari_fiberburst.settings import Settings, choose
+from napari_fiberburst.settings import PublishedMethod, Settings, choose
 
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
@@ -107,7 +107,7 @@ def _check(options: argparse.Namespace, settings: Settings) -> None:
     given = [name for name in ("bundle", "calibration", "keep_bundle") if getattr(options, name) is not None]
     if given[:2] == ["bundle", "calibration"]:
         raise SettingsError("--calibration is short for --bundle with a picture; give one of the two")
-    if given and settings.is_published:
+    if given and isinstance(settings.method, PublishedMethod):
         raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
     if options.keep_bundle is not None:
         from napari_fiberburst.bundle.bundle import Bundle
