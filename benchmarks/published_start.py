@@ -1,14 +1,15 @@
 """How the start of the published method decides where it ends.
 
 The published motion network starts some pixels away from the identity. Started at the identity itself, the frames lie
-on one another at first, and a honeycomb that stands still explains them well. Both are fitted to the same burst here,
+on one another at first, and a honeycomb that stands still explains them well. Both are fitted to the same bursts here,
 with everything else as published, and their pictures are compared with the truth on the way.
 
-    python -m benchmarks.published_start                  # some 15 minutes on two cores
+    python -m benchmarks.published_start                  # some 20 minutes on two cores
     python -m benchmarks.published_start --steps 3000 --sigma 3
 """
 
 import argparse
+from itertools import product
 from pathlib import Path
 
 from benchmarks import report
@@ -22,6 +23,7 @@ from napari_fiberburst.quality import motion_error, psnr, ssim
 from napari_fiberburst.simulation import SimulatedBurst, simulate
 
 STEPS_BETWEEN_LOOKS = 40
+PUBLISHED_SIGMA = 5.0  # cycles per half frame
 LABELS = {"published": "start as published", "identity": "start at the identity"}
 
 
@@ -29,16 +31,19 @@ def main() -> None:
     """Fit from both starts, write the curves, draw them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=800)
-    parser.add_argument("--sigma", type=float, default=5.0, help="cycles per half frame, published 5")
+    parser.add_argument("--sigma", type=float, default=PUBLISHED_SIGMA, help="cycles per half frame, published 5")
     parser.add_argument("--side", type=int, default=384, help="of the frames, pixels")
+    parser.add_argument("--bursts", type=int, nargs="+", default=[0, 2], help="seeds of the bursts, default 0 and 2")
     parser.add_argument("--starts", nargs="+", choices=LABELS, default=list(LABELS))
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder, default benchmarks/results")
     options = parser.parse_args()
     shape = (options.side, options.side)
-    simulated = simulate("histology", shape=shape, frames=20, pitch=4.0, physics="mask", seed=0)
     results = Results(options.results)
-    for start in options.starts:
-        name = f"{LABELS[start]}, sigma {options.sigma:g}"
+    for seed, start in product(options.bursts, options.starts):
+        simulated = simulate("histology", shape=shape, frames=20, pitch=4.0, physics="mask", seed=seed)
+        name = f"{LABELS[start]}, burst {seed}"
+        if options.sigma != PUBLISHED_SIGMA:
+            name += f", sigma {options.sigma:g}"
         print(name, flush=True)
         curve = fit(simulated, options.steps, options.sigma, is_identity=start == "identity")
         write_start_curves(options.results, {**results.start_curves, name: curve})
