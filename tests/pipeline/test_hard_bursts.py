@@ -215,7 +215,7 @@ def test_a_calibration_image_may_be_a_file_and_is_cropped_along(cores, tmp_path)
     ("choices", "error", "said"),
     [
         ({"calibration": np.zeros((27, 29))}, BundleError, "is black"),
-        ({"calibration": "no such file.png"}, BundleError, "expected a picture"),
+        ({"calibration": "no such file.png"}, BundleError, "got no such file.png"),
         ({"preset": "paper", "calibration": np.eye(27)}, SettingsError, "no model of the bundle"),
         ({"motion": "flow"}, SettingsError, "needs a network"),
     ],
