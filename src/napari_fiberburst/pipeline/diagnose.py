@@ -25,7 +25,7 @@ from napari_fiberburst.scene.spline import assemble
 # Less than this part of a sample is the rim of one.
 _LEAST_COVERAGE = 0.1
 # Iterations of conjugate gradients for what a scene makes of wrong gains; and the least part that it does not follow.
-_PROBE_ITERATIONS, _LEAST_FREE = 25, 0.05
+_PROBE_ITERATIONS, _LEAST_FREE = 8, 0.05
 # A core is saturated that has no sample in this part of the frames.
 _MOSTLY = 0.5
 
