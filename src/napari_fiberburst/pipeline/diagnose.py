@@ -164,21 +164,18 @@ def _as_seen(bundle: Bundle, registration: Registration, scene: Scene, weights: 
     Where the gains were not known before, and the object moves, this burst has measured them.
     """
     samples, gains = scene.samples, scene.gains
-    bundle = with_gains(bundle, torch.from_numpy(registration.gains))
-    transmission, channels = bundle.transmission, bundle.gains
+    bundle = with_gains(bundle, torch.from_numpy(registration.gains), gains.channels)
+    transmission = bundle.transmission
     if gains.shares is not None:
         x, y = samples.positions.cpu().numpy().astype(np.intp).T
         transmission = transmission.copy()
         transmission[y, x] *= gains.shares.cpu().numpy()
-    if gains.channels is not None:
-        channels = (bundle.gains * gains.channels.cpu().numpy()).astype(np.float32)
     used = samples.weights[torch.from_numpy(registration.used)]
     usable = torch.zeros(len(used), samples.cores).to(used).index_add_(1, samples.core_index, used) > 0
     is_measured = not bundle.gains_known and not registration.is_still
     return replace(
         bundle,
         transmission=transmission,
-        gains=channels,
         gain_weights=weights.cpu().numpy().astype(np.float32) if is_measured else bundle.gain_weights,
         saturated=(usable.float().mean(dim=0) < _MOSTLY).cpu().numpy(),
     )
