@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin peers docs docs-pictures docs-results screenshots clean
+.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin peers docs docs-images docs-results screenshots clean
 
 demo: .venv/base
 	mkdir -p demo
@@ -63,7 +63,7 @@ docs: .venv/docs
 
 # What the site shows of the examples, and of the latest `make bench`. Rows that were not measured anew stay; only some
 # tables: make docs-results MORE="--tables 1 2"
-docs-pictures: .venv/bench
+docs-images: .venv/bench
 	mkdir -p docs/gallery
 	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence where_it_fails; do \
 	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done

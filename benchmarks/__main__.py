@@ -55,7 +55,7 @@ def run(
     for number in options.tables:
         print(f"Table {NUMBERED[number]}", flush=True)
         if number == 1:
-            compare(recorder, NUMBERED[1], scenes, chosen, effort, pictures=True)
+            compare(recorder, NUMBERED[1], scenes, chosen, effort, images=True)
         elif number == 2:
             case = cases.ablation(is_quick=options.quick)
             steps = options.ablation_iterations or (20 if options.quick else 1000)
@@ -63,7 +63,7 @@ def run(
         elif number == 3:
             fast = [name for name in chosen if name not in SLOW]
             bursts = cases.conditions(is_quick=options.quick)
-            compare(recorder, NUMBERED[3], bursts, fast, effort, pictures=False)
+            compare(recorder, NUMBERED[3], bursts, fast, effort, images=False)
         elif number == 4 and real is None:
             print("  skipped: --burst FOLDER names the real burst")
         elif number == 4:

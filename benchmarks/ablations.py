@@ -45,7 +45,7 @@ def _row(
     def compute() -> Row:
         simulated = case.make()
         outcome = reconstructed(simulated, **choices)
-        return {**score(outcome, simulated), "picture": outcome.picture}
+        return {**score(outcome, simulated), "image": outcome.image}
 
     name = f"{motion} {encoding} {'with' if preset == 'auto' else 'without'} bundle model"
     recipe = {"burst": asdict(case), "bundle_model": preset == "auto", **choices}

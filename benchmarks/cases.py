@@ -110,8 +110,8 @@ class Case:
         loads = {"histology": skimage.data.immunohistochemistry, "cat": skimage.data.cat, "retina": skimage.data.retina}
         if self.scene not in corners and self.scene not in loads:
             return self.scene  # drawn at any size
-        picture = loads.get(self.scene, skimage.data.immunohistochemistry)().astype(np.float32) / 255
-        large = np.clip(zoom(picture, (self.magnify, self.magnify, 1), order=3, mode="mirror"), 0, 1)
+        image = loads.get(self.scene, skimage.data.immunohistochemistry)().astype(np.float32) / 255
+        large = np.clip(zoom(image, (self.magnify, self.magnify, 1), order=3, mode="mirror"), 0, 1)
         height, width = large.shape[:2]
         middle = ((width - self.side) / 2 / width, (height - self.side) / 2 / height)
         part_x, part_y = corners.get(self.scene, middle)

@@ -1,8 +1,8 @@
-"""The resolution chart behind a real bundle: what of it a picture shows, and how much honeycomb is left.
+"""The resolution chart behind a real bundle: what of it an image shows, and how much honeycomb is left.
 
 The burst is PyFibreBundle's test data (Mike Hughes, MIT licence): 12 frames of a USAF-1951 chart, groups 6 and 7,
 through 27,800 cores. The places below are where that burst's first frame shows the chart, (x, y) in pixels, integers at
-pixel centres. A picture of it is read through the `Canvas` that says where it lies on that frame.
+pixel centres. An image of it is read through the `Canvas` that says where it lies on that frame.
 """
 
 import math
@@ -45,22 +45,22 @@ RING = (0.85, 1.15)
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A picture of the chart, to be read at frame-0 points.
+    """An image of the chart, to be read at frame-0 points.
 
     Parameters
     ----------
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W); NaN counts as the mean.
     canvas : Canvas
         Where it lies on frame 0.
     """
 
-    picture: NDArray[np.floating]
+    image: NDArray[np.floating]
     canvas: Canvas
 
     @cached_property
     def _coefficients(self) -> NDArray[np.float64]:
-        known = np.where(np.isfinite(self.picture), self.picture, np.nanmean(self.picture)).astype(np.float64)
+        known = np.where(np.isfinite(self.image), self.image, np.nanmean(self.image)).astype(np.float64)
         coefficients: NDArray[np.float64] = spline_filter(known, 3, mode="mirror")
         return coefficients
 
@@ -83,7 +83,7 @@ class Shown:
         return dark, float(np.mean(clear))
 
     def at(self, x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the picture at frame-0 points, by cubic splines."""
+        """Return the image at frame-0 points, by cubic splines."""
         points = np.stack([x, y, np.ones_like(x)])
         column, row, depth = np.tensordot(np.linalg.inv(self.canvas.reference_from_image), points, axes=1)
         found: NDArray[np.float64] = map_coordinates(
@@ -144,7 +144,7 @@ class Shown:
     def _profile(
         self, place: tuple[int, int, str], centre: tuple[float, float] | None = None
     ) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
-        """Return places across the bars, the period, and the picture there, (across, along)."""
+        """Return places across the bars, the period, and the image there, (across, along)."""
         group, element, bars = place
         period = period_of(group, element)
         across, along = np.linspace(-1.75, 1.75, 141) * period, np.linspace(-0.875, 0.875, 41) * period

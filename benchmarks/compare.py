@@ -1,9 +1,9 @@
 """Tables 1 and 3: every method on every burst, scored against the truth in two ways.
 
 PSNR and SSIM are of frame 0, every pixel. "Matched" is after the one gain and offset per channel that bring the
-picture closest to the truth: a bundle passes only part of the light, no burst can tell how large a part, and so the
+image closest to the truth: a bundle passes only part of the light, no burst can tell how large a part, and so the
 quality of a method shows in the error that remains. "As given" is without: the paper prints it of a captured frame, and
-it depends mostly on how dark a method leaves its picture.
+it depends mostly on how dark a method leaves its image.
 """
 
 from collections.abc import Sequence
@@ -25,20 +25,20 @@ SLOW = ("inpainting", "paper")
 
 
 def compare(
-    recorder: Recorder, table: str, cases: Sequence[Case], methods: Sequence[str], effort: Effort, *, pictures: bool
+    recorder: Recorder, table: str, cases: Sequence[Case], methods: Sequence[str], effort: Effort, *, images: bool
 ) -> None:
-    """Fill the rows of a table; `pictures` keeps what each method draws, and the truth."""
+    """Fill the rows of a table; `images` keeps what each method draws, and the truth."""
     for case in cases:
         print(case, flush=True)
-        if pictures:
-            recorder.row(table, case.name, "truth", lambda case=case: {"picture": case.make().truth[0]})  # type: ignore[misc]
+        if images:
+            recorder.row(table, case.name, "truth", lambda case=case: {"image": case.make().truth[0]})  # type: ignore[misc]
         for name in methods:
             recipe = {"burst": asdict(case), **{part: getattr(effort, part) for part in METHODS[name].depends_on}}
-            row = recorder.row(table, case.name, name, lambda: measure(case, name, effort, pictures=pictures), recipe)  # noqa: B023
+            row = recorder.row(table, case.name, name, lambda: measure(case, name, effort, images=images), recipe)  # noqa: B023
             print(f"  {METHODS[name].label:34} {in_words(row)}", flush=True)
 
 
-def measure(case: Case, name: str, effort: Effort, *, pictures: bool) -> Row:
+def measure(case: Case, name: str, effort: Effort, *, images: bool) -> Row:
     """Return one row."""
     simulated = case.make()
     try:
@@ -46,18 +46,18 @@ def measure(case: Case, name: str, effort: Effort, *, pictures: bool) -> Row:
     except PeerError as error:
         return {"missing": str(error)}
     row = score(outcome, simulated)
-    if pictures:
-        row["picture"] = match_levels(outcome.picture, simulated.truth[0])
+    if images:
+        row["image"] = match_levels(outcome.image, simulated.truth[0])
     return row
 
 
 def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
-    """Return how close a picture and its motion come to the truth."""
-    truth, picture = simulated.truth[0], np.nan_to_num(outcome.picture)
+    """Return how close an image and its motion come to the truth."""
+    truth, image = simulated.truth[0], np.nan_to_num(outcome.image)
     row: Row = {
-        "psnr": psnr(picture, truth),
-        "ssim": ssim(picture, truth),
-        **as_given(picture, truth),
+        "psnr": psnr(image, truth),
+        "ssim": ssim(image, truth),
+        **as_given(image, truth),
         "seconds": outcome.seconds,
         "compression": outcome.compression,
         "curve": outcome.curve,
@@ -69,9 +69,9 @@ def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
     return row
 
 
-def as_given(picture: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:
-    """Return PSNR and SSIM of a picture as it is, 1 as full scale."""
-    exact, shown = np.asarray(truth, np.float64), np.asarray(picture, np.float64)
+def as_given(image: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:
+    """Return PSNR and SSIM of an image as it is, 1 as full scale."""
+    exact, shown = np.asarray(truth, np.float64), np.asarray(image, np.float64)
     return {
         "psnr_as_given": float(peak_signal_noise_ratio(exact, shown, data_range=1)),
         "ssim_as_given": float(structural_similarity(exact, shown, data_range=1, channel_axis=2)),

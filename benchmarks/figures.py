@@ -1,4 +1,4 @@
-"""Figures, by matplotlib, from the rows and pictures of a results folder."""
+"""Figures, by matplotlib, from the rows and images of a results folder."""
 
 from collections.abc import Iterator
 from io import BytesIO
@@ -29,7 +29,7 @@ COLOURS = (
 
 
 def drawn(results: Results) -> Iterator[tuple[str, Figure]]:
-    """Yield all figures whose rows and pictures are there, by name."""
+    """Yield all figures whose rows and images are there, by name."""
     mpl.use("Agg")
     for name, make in FIGURES.items():
         figure = make(results)
@@ -54,19 +54,19 @@ def _scenes(results: Results) -> Figure | None:
     rows = {(row["case"], row["method"]): row for row in results.rows(SCENES)}
     cases = list(dict.fromkeys(case for case, _ in rows))
     columns = [name for name in ("truth", *METHODS) if any(method == name for _, method in rows)]
-    pictures = {key: results.picture(SCENES, *key) for key, row in rows.items() if "missing" not in row}
-    if not cases or any(picture is None for picture in pictures.values()):
+    images = {key: results.image(SCENES, *key) for key, row in rows.items() if "missing" not in row}
+    if not cases or any(image is None for image in images.values()):
         return None
     figure, axes = plt.subplots(
         len(cases), len(columns), figsize=(1.9 * len(columns), 2.2 * len(cases)), squeeze=False, layout="constrained"
     )
     for number, (across, case) in enumerate(zip(axes, cases, strict=True)):
         for axis, method in zip(across, columns, strict=True):
-            picture = pictures.get((case, method))
+            image = images.get((case, method))
             axis.set_xticks([])
             axis.set_yticks([])
-            if picture is not None:
-                axis.imshow(picture, cmap="gray", vmin=0, vmax=255)
+            if image is not None:
+                axis.imshow(image, cmap="gray", vmin=0, vmax=255)
             row = rows.get((case, method), {})
             axis.set_xlabel(f"{row['psnr']:.1f} dB" if "psnr" in row else row.get("missing", "")[:14], fontsize=8)
             if number == 0:
@@ -130,12 +130,12 @@ def _conditions(results: Results) -> Figure | None:
 def _real(results: Results) -> Figure | None:
     found = {row["method"]: row for row in results.rows(REAL) if "elements" in row}
     names = [name for name in METHODS if name in found]
-    pictures = [picture for name in names if (picture := results.picture(REAL, "chart", name)) is not None]
-    if not names or len(pictures) < len(names):
+    images = [image for name in names if (image := results.image(REAL, "chart", name)) is not None]
+    if not names or len(images) < len(names):
         return None
     figure, axes = plt.subplots(1, len(names), figsize=(3.1 * len(names), 3.9), squeeze=False, layout="constrained")
-    for axis, name, picture in zip(axes[0], names, pictures, strict=True):
-        axis.imshow(picture[380:860, 90:390], cmap="gray", vmin=0, vmax=255)  # group 7
+    for axis, name, image in zip(axes[0], names, images, strict=True):
+        axis.imshow(image[380:860, 90:390], cmap="gray", vmin=0, vmax=255)  # group 7
         axis.set_title(
             f"{METHODS[name].label}\nM {found[name]['modulation']:.2f}, ring {found[name]['ring_db']:.0f} dB",
             fontsize=8,

@@ -3,7 +3,7 @@
     python -P benchmarks/fit_once.py BURST.npz RESULT.npz
 
 Of napari_fiberburst it imports what all versions have. In: `frames` (T, H, W, C) as recorded, `black_level` and
-`white_level`, `scale`, picture pixels to a frame pixel, and `device`. Out: `picture`, frame 0's field, `seconds`
+`white_level`, `scale`, image pixels to a frame pixel, and `device`. Out: `image`, frame 0's field, `seconds`
 without imports and reading, and `package`, the folder of the package that made it.
 """
 
@@ -30,9 +30,9 @@ def main() -> None:
     )
     start = time.perf_counter()
     result = reconstruct(burst, device=str(inputs["device"]), fill=True)
-    picture = result.image if inputs["scale"] == 1 else result.render(scale=float(inputs["scale"]))
+    image = result.image if inputs["scale"] == 1 else result.render(scale=float(inputs["scale"]))
     seconds = time.perf_counter() - start
-    np.savez(target, picture=picture, seconds=seconds, package=str(Path(napari_fiberburst.__file__).parent))
+    np.savez(target, image=image, seconds=seconds, package=str(Path(napari_fiberburst.__file__).parent))
 
 
 if __name__ == "__main__":

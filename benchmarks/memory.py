@@ -15,7 +15,7 @@ from napari_fiberburst.simulation import simulate
 def fit(path: Path) -> None:
     """Fit and save the burst in a file; print this process's peak memory in MiB."""
     result = reconstruct(path, preset="paper", iterations=4, device="cpu", preview_every=1e-6)
-    result.save(path.with_name("picture.ome.tif"))
+    result.save(path.with_name("image.ome.tif"))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(peak / 2**20 if sys.platform == "darwin" else peak / 2**10)  # bytes there, KiB on Linux
 

@@ -1,4 +1,4 @@
-"""The methods: each makes one picture of a burst, and says what it is given beside the burst."""
+"""The methods: each makes one image of a burst, and says what it is given beside the burst."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ from napari_fiberburst.settings import SplineMethod
 from napari_fiberburst.simulation import SimulatedBurst
 from napari_fiberburst.steps import drain
 
-Picture = NDArray[np.float32]
+Image = NDArray[np.float32]
 # Standard deviations of the Gaussian filters, pixels: 31 to choose from, and one for all bursts.
 WIDTHS = np.arange(0.5, 8.1, 0.25)
 FIXED_WIDTH = 2.0
@@ -61,7 +61,7 @@ class Outcome:
 
     Attributes
     ----------
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W, C) on frame 0's pixels, 1 as full scale.
     seconds : float
         What it took, reading and simulating left out.
@@ -72,10 +72,10 @@ class Outcome:
     curve : list of (float, float)
         Seconds and PSNR of its previews, where it has any.
     notes : tuple of str
-        What it says itself of its picture.
+        What it says itself of its image.
     """
 
-    picture: Picture
+    image: Image
     seconds: float
     homographies: NDArray[np.float64] | None = None
     compression: float | None = None
@@ -107,24 +107,24 @@ class Method:
 
 def captured(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return frame 0 as it is."""
-    return Outcome(picture=simulated.burst.frames[0], seconds=0.0)
+    return Outcome(image=simulated.burst.frames[0], seconds=0.0)
 
 
 def gaussian(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
-    """Return frame 0, filtered by the width whose picture is closest to the truth."""
+    """Return frame 0, filtered by the width whose image is closest to the truth."""
     truth = simulated.truth[0]
     start = time.perf_counter()
     tried = [blurred(simulated.burst.frames[0], width) for width in WIDTHS]
     seconds = (time.perf_counter() - start) / len(WIDTHS)
     best = max(range(len(WIDTHS)), key=lambda number: psnr(tried[number], truth))
-    return Outcome(picture=tried[best], seconds=seconds, notes=(f"width {WIDTHS[best]:g} px",))
+    return Outcome(image=tried[best], seconds=seconds, notes=(f"width {WIDTHS[best]:g} px",))
 
 
 def gaussian_fixed(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return frame 0, filtered by the same width in every case."""
     start = time.perf_counter()
-    picture = blurred(simulated.burst.frames[0], FIXED_WIDTH)
-    return Outcome(picture=picture, seconds=time.perf_counter() - start)
+    image = blurred(simulated.burst.frames[0], FIXED_WIDTH)
+    return Outcome(image=image, seconds=time.perf_counter() - start)
 
 
 def registered_mean(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
@@ -132,8 +132,8 @@ def registered_mean(case: Case, simulated: SimulatedBurst, effort: Effort) -> Ou
     start = time.perf_counter()
     fitted = drain(Stages(simulated.burst, SplineMethod(), find_device(effort.device)).align())
     homographies = fitted.registration.reference_from_frame
-    picture = mean_over(simulated.burst.frames, homographies)
-    return Outcome(picture=picture, seconds=time.perf_counter() - start, homographies=homographies)
+    image = mean_over(simulated.burst.frames, homographies)
+    return Outcome(image=image, seconds=time.perf_counter() - start, homographies=homographies)
 
 
 def fibrebundle_single(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
@@ -150,19 +150,19 @@ def supervised(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome
     """Return what the trained network makes of frame 0."""
     network = unet.load()
     start = time.perf_counter()
-    picture = unet.clean(simulated.burst.frames[0], network)
-    return Outcome(picture=picture, seconds=time.perf_counter() - start)
+    image = unet.clean(simulated.burst.frames[0], network)
+    return Outcome(image=image, seconds=time.perf_counter() - start)
 
 
 def inpainted(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     """Return what a coordinate network draws between the cores of frame 0."""
     start = time.perf_counter()
-    picture = inpainting.inpaint(simulated.burst.frames[0], simulated.bundle, steps=effort.inpainting_steps)
-    return Outcome(picture=picture, seconds=time.perf_counter() - start)
+    image = inpainting.inpaint(simulated.burst.frames[0], simulated.bundle, steps=effort.inpainting_steps)
+    return Outcome(image=image, seconds=time.perf_counter() - start)
 
 
 def paper(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
-    """Return the published method's picture; its sigma is to the bundle as the published one was to its bundle."""
+    """Return the published method's image; its sigma is to the bundle as the published one was to its bundle."""
     return reconstructed(
         simulated, preset="paper", sigma=case.sigma, iterations=effort.paper_iterations, device=effort.device
     )
@@ -181,7 +181,7 @@ def oracle(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     known = Registration.known(simulated.homographies, samples.cores)
     image = render(burst, bundle, known, solve(samples, known), fill=True)
     return Outcome(
-        picture=_in_full_scale(simulated, image),
+        image=_in_full_scale(simulated, image),
         seconds=time.perf_counter() - start,
         homographies=simulated.homographies,
     )
@@ -241,13 +241,13 @@ def reconstructed(simulated: SimulatedBurst, **choices: Any) -> Outcome:
     return _outcome(simulated, result, time.perf_counter() - start, curve)
 
 
-def blurred(frame: Picture, width: float) -> Picture:
+def blurred(frame: Image, width: float) -> Image:
     """Return a frame (H, W, C) after a Gaussian filter."""
-    filtered: Picture = gaussian_filter(frame, (width, width, 0))
+    filtered: Image = gaussian_filter(frame, (width, width, 0))
     return filtered
 
 
-def mean_over(frames: Picture, homographies: NDArray[np.float64]) -> Picture:
+def mean_over(frames: Image, homographies: NDArray[np.float64]) -> Image:
     """Return the mean of the frames on frame 0's pixels, cubic splines between pixels; frame 0 where no other saw."""
     rows, columns = np.indices(frames.shape[1:3], dtype=np.float64)
     points = np.stack([columns, rows, np.ones_like(rows)])
@@ -263,13 +263,11 @@ def mean_over(frames: Picture, homographies: NDArray[np.float64]) -> Picture:
         seen = np.isfinite(moved).all(axis=-1)
         total[seen] += moved[seen]
         count += seen
-    mean: Picture = np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], frames[0]).astype(
-        np.float32
-    )
+    mean: Image = np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], frames[0]).astype(np.float32)
     return mean
 
 
-def fibrebundle(method: str, **inputs: Any) -> tuple[Picture, float]:
+def fibrebundle(method: str, **inputs: Any) -> tuple[Image, float]:
     """Run PyFibreBundle; see `benchmarks/peers/pyfibrebundle.py` for its inputs.
 
     Raises
@@ -287,11 +285,11 @@ def fibrebundle(method: str, **inputs: Any) -> tuple[Picture, float]:
             said = ended.stderr.strip().splitlines() or [f"exit status {ended.returncode}"]
             raise PeerError(f"failed: {said[-1]}")
         with np.load(made) as found:
-            return found["picture"], float(found["seconds"])
+            return found["image"], float(found["seconds"])
 
 
 def _fibrebundle(method: str, case: Case, simulated: SimulatedBurst) -> Outcome:
-    picture, seconds = fibrebundle(
+    image, seconds = fibrebundle(
         method,
         frames=simulated.burst.frames,
         bundle=simulated.transmission,
@@ -302,14 +300,14 @@ def _fibrebundle(method: str, case: Case, simulated: SimulatedBurst) -> Outcome:
         size=case.side,
         grid=case.side,
     )
-    return Outcome(picture=picture, seconds=seconds)
+    return Outcome(image=image, seconds=seconds)
 
 
 def _outcome(
     simulated: SimulatedBurst, result: Reconstruction, seconds: float, curve: list[tuple[float, float]]
 ) -> Outcome:
     return Outcome(
-        picture=_in_full_scale(simulated, result.image),
+        image=_in_full_scale(simulated, result.image),
         seconds=seconds,
         homographies=result.homographies,
         compression=result.compression,
@@ -318,7 +316,7 @@ def _outcome(
     )
 
 
-def _in_full_scale(simulated: SimulatedBurst, picture: NDArray[np.floating]) -> Picture:
+def _in_full_scale(simulated: SimulatedBurst, image: NDArray[np.floating]) -> Image:
     burst = simulated.burst
-    scaled: Picture = ((picture - burst.black_level) / (burst.white_level - burst.black_level)).astype(np.float32)
+    scaled: Image = ((image - burst.black_level) / (burst.white_level - burst.black_level)).astype(np.float32)
     return scaled if scaled.ndim == 3 else scaled[..., None]

@@ -1,4 +1,4 @@
-"""How the plugin keeps up with the script: first picture, speed, and how long the window is held up.
+"""How the plugin keeps up with the script: first image, speed, and how long the window is held up.
 
 Runs in a window that is drawn, under Xvfb on a machine without a display: `xvfb-run python benchmarks/plugin.py`.
 """
@@ -91,7 +91,7 @@ def measure_speed() -> None:
             longest = ", ".join(f"{gap:.0f}" for gap in found["gaps"][:3])
             late = sum(gap > 100 for gap in found["gaps"])
             print(
-                f"{name:18} {'cold' if number == 0 else 'warm'}: first picture {found['first']:.1f} s; "
+                f"{name:18} {'cold' if number == 0 else 'warm'}: first image {found['first']:.1f} s; "
                 f"{found['rate']:.2f} it/s, script {script:.2f}, ratio {found['rate'] / script:.2f}; window away for "
                 f"{longest} ms at most, over 100 ms {late} times"
             )

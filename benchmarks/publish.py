@@ -1,8 +1,8 @@
 """Put what a results folder has into the documentation: rows, tables, figures, curves of the published start.
 
 A row that was published before stays until it is measured anew, so that a part of the benchmark can be published. The
-figures become WebP, because they are to be looked at and stay in the repository's history. A figure of pictures is
-drawn anew only where the results folder has the pictures of all its rows.
+figures become WebP, because they are to be looked at and stay in the repository's history. A figure of images is
+drawn anew only where the results folder has the images of all its rows.
 """
 
 import argparse
@@ -59,7 +59,7 @@ def publish(folder: Path, target: Path, numbers: Sequence[int], *, overwrite: bo
     OutputError
         There is nothing to publish, or it is of another kind of run than what is published.
     """
-    measured, published = Results(folder), Results(target, pictures=folder / "pictures")
+    measured, published = Results(folder), Results(target, images=folder / "images")
     found = [number for number in numbers if measured.rows(NUMBERED[number])]
     if not found and not measured.start_curves:
         raise OutputError(f"{folder} has no rows of tables {list(numbers)}; measure them by python -m benchmarks")
@@ -102,7 +102,7 @@ def _draw(published: Results, names: Sequence[str]) -> None:
             drawn.add(name)
     for name in sorted({*names} - drawn):
         if (folder / f"{name}.webp").exists():
-            print(f"{name}.webp stays as it was: the results do not have the pictures of all its rows")
+            print(f"{name}.webp stays as it was: the results do not have the images of all its rows")
 
 
 if __name__ == "__main__":

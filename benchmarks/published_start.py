@@ -2,7 +2,7 @@
 
 The published motion network starts some pixels away from the identity. Started at the identity itself, the frames lie
 on one another at first, and a honeycomb that stands still explains them well. Both are fitted to the same bursts here,
-with everything else as published, and their pictures are compared with the truth on the way.
+with everything else as published, and their images are compared with the truth on the way.
 
     python -m benchmarks.published_start                  # some 20 minutes on two cores
     python -m benchmarks.published_start --steps 3000 --sigma 3

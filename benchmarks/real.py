@@ -67,8 +67,8 @@ def captured(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
 def gaussian(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return frame 0, filtered."""
     start = time.perf_counter()
-    picture = gaussian_filter(frames[0].astype(float), FIXED_WIDTH)
-    return Shown(picture, Canvas.over(FIELD)), time.perf_counter() - start
+    image = gaussian_filter(frames[0].astype(float), FIXED_WIDTH)
+    return Shown(image, Canvas.over(FIELD)), time.perf_counter() - start
 
 
 def fibrebundle_single(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
@@ -84,8 +84,8 @@ def fibrebundle_super(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown
 def default(real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
     """Return what `reconstruct` makes of the frames."""
     start = time.perf_counter()
-    picture = reconstruct(Burst(frames), device=real.device).render(scale=SCALE)
-    return Shown(picture, Canvas.over(FIELD, SCALE)), time.perf_counter() - start
+    image = reconstruct(Burst(frames), device=real.device).render(scale=SCALE)
+    return Shown(image, Canvas.over(FIELD, SCALE)), time.perf_counter() - start
 
 
 Method = Callable[[RealBurst, NDArray[np.uint8]], tuple[Shown, float]]
@@ -139,12 +139,12 @@ def _measure(real: RealBurst, method: Method, honeycomb: float) -> Row:
         "ring_db": 20 * np.log10(shown.ring() / honeycomb),
         "nrmse": float(np.mean(errors)),
         "profiles": profiles,
-        "picture": 0.9 * (shown.at(part[..., 0], part[..., 1]) - dark) / (light - dark) + 0.05,
+        "image": 0.9 * (shown.at(part[..., 0], part[..., 1]) - dark) / (light - dark) + 0.05,
     }
 
 
 def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> tuple[Shown, float]:
-    picture, seconds = fibrebundle(
+    image, seconds = fibrebundle(
         method,
         frames=np.maximum(frames.astype(np.float64) - BLACK_LEVEL, 0)[..., None] / 255,
         bundle=np.maximum(real.background.astype(np.float64) - BLACK_LEVEL, 0) / 255,
@@ -157,7 +157,7 @@ def _fibrebundle(method: str, real: RealBurst, frames: NDArray[np.uint8]) -> tup
     # Its pixels reach from the centre of the first pixel of the square to that of the last.
     step = (SIZE - 1) / (SCALE * SIZE - 1)
     matrix = np.array([[step, 0, CORNER[0]], [0, step, CORNER[1]], [0, 0, 1]])
-    return Shown(picture[..., 0], Canvas(shape=picture.shape[:2], reference_from_image=matrix)), seconds
+    return Shown(image[..., 0], Canvas(shape=image.shape[:2], reference_from_image=matrix)), seconds
 
 
 def _prediction_error(real: RealBurst, shown: Shown, left: int) -> float:

@@ -80,7 +80,7 @@ def _scenes(results: Results) -> list[str]:
         header = ["", "told", "PSNR dB / SSIM", "as given", "motion off by", "time", "compression"]
         lines = [[METHODS[name].label, METHODS[name].given, *_scored(own[name])] for name in METHODS if name in own]
         parts.append(table(header, lines))
-    return [*parts, "![Table 1 in pictures](figures/scenes.png)"]
+    return [*parts, "![Table 1 in images](figures/scenes.png)"]
 
 
 def _scored(row: Row) -> list[str]:
@@ -265,7 +265,7 @@ def _reached(rows: Sequence[Row], decibels: float, count: int) -> str:
 
 
 def seconds_to(row: Row, decibels: float) -> float | None:
-    """Return from when on a method showed pictures of at least this PSNR; None where its last one is not."""
+    """Return from when on a method showed images of at least this PSNR; None where its last one is not."""
     found = None
     for seconds, psnr in reversed([*row["curve"], (row["seconds"], row["psnr"])]):
         if psnr < decibels:

@@ -41,18 +41,18 @@ Curve = list[tuple[int, float, float, float]]
 
 @dataclass(frozen=True)
 class Results:
-    """A folder of rows and pictures, to read.
+    """A folder of rows and images, to read.
 
     Attributes
     ----------
     folder : Path
         Holds ``rows/``, a JSONL file a table, and ``about.json``.
-    pictures : Path, optional
-        Where the pictures are, a PNG a row; default ``pictures/`` in the folder.
+    images : Path, optional
+        Where the images are, a PNG a row; default ``images/`` in the folder.
     """
 
     folder: Path
-    pictures: Path | None = None
+    images: Path | None = None
 
     def rows(self, table: str) -> list[Row]:
         """Return all rows of a table that are there, in the order in which they were measured first."""
@@ -62,14 +62,14 @@ class Results:
         """Return where a table's rows are."""
         return self.folder / "rows" / f"{slug(table)}.jsonl"
 
-    def picture(self, table: str, case: str, method: str) -> NDArray[np.uint8] | None:
-        """Return a row's picture; None where there is none."""
-        path = self.picture_file(table, case, method)
+    def image(self, table: str, case: str, method: str) -> NDArray[np.uint8] | None:
+        """Return a row's image; None where there is none."""
+        path = self.image_file(table, case, method)
         return np.asarray(Image.open(path)) if path.exists() else None
 
-    def picture_file(self, table: str, case: str, method: str) -> Path:
-        """Return where a row's picture is."""
-        return (self.pictures or self.folder / "pictures") / slug(table) / f"{slug(case)}.{slug(method)}.png"
+    def image_file(self, table: str, case: str, method: str) -> Path:
+        """Return where a row's image is."""
+        return (self.images or self.folder / "images") / slug(table) / f"{slug(case)}.{slug(method)}.png"
 
     @property
     def about(self) -> Row:
@@ -125,7 +125,7 @@ class Recorder:
     def _begin(self, mode: str, *, resume: bool, overwrite: bool) -> None:
         folder, before = self.results.folder, self.results.about
         if before and overwrite:
-            for path in [path for made in ("rows/*.jsonl", "pictures/*/*", "figures/*") for path in folder.glob(made)]:
+            for path in [path for made in ("rows/*.jsonl", "images/*/*", "figures/*") for path in folder.glob(made)]:
                 path.unlink()
             before = {}
         elif before and not resume:
@@ -149,7 +149,7 @@ class Recorder:
         table, case, method : str
             Where it stands.
         compute : callable
-            Makes what was found. A picture in it, (H, W) or (H, W, C) with 1 as full scale, is written beside the rows
+            Makes what was found. An image in it, (H, W) or (H, W, C) with 1 as full scale, is written beside the rows
             as PNG.
         recipe : dict, optional
             Becomes part of the row: the burst, and how many steps a method may take.
@@ -162,9 +162,9 @@ class Recorder:
             if is_same and "missing" not in known:  # a peer may have been installed since
                 return known
         found = {"table": table, "case": case, "method": method, **recipe, **compute()}
-        picture = found.pop("picture", None)
-        if picture is not None:
-            write_picture(self.results.picture_file(table, case, method), picture)
+        image = found.pop("image", None)
+        if image is not None:
+            write_image(self.results.image_file(table, case, method), image)
         put_row(path, {**found, "commit": self._commit, "date": now()})
         return found
 
@@ -246,10 +246,10 @@ def write_start_curves(folder: Path, curves: dict[str, Curve]) -> None:
     write_whole(folder / _START_CURVES, json.dumps(curves).encode() + b"\n")
 
 
-def write_picture(path: Path, picture: NDArray[np.floating]) -> None:
-    """Write a picture whose full scale is 1."""
+def write_image(path: Path, image: NDArray[np.floating]) -> None:
+    """Write an image whose full scale is 1."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    levels = np.rint(np.clip(np.nan_to_num(picture), 0, 1) * 255).astype(np.uint8)
+    levels = np.rint(np.clip(np.nan_to_num(image), 0, 1) * 255).astype(np.uint8)
     channels = levels.shape[2] if levels.ndim == 3 else 0
     Image.fromarray(levels[..., 0] if channels == 1 else levels).save(path)
 

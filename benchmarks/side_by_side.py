@@ -40,7 +40,7 @@ _WORKER = Path(__file__).with_name("fit_once.py")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
-    """A burst and how to judge a picture of it.
+    """A burst and how to judge an image of it.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Trial:
     inputs : dict
         As `benchmarks/fit_once.py` reads them.
     quality : callable
-        Picture to quality, dB.
+        Image to quality, dB.
     """
 
     name: str
@@ -168,14 +168,14 @@ def simulated(name: str, case: Case, device: str) -> Trial:
     made = case.make()
     levels = {"black_level": made.burst.black_level, "white_level": made.burst.white_level}
     inputs = {"frames": made.arrays()["frames"], **levels, "scale": 1, "device": device}
-    return Trial(name=name, inputs=inputs, quality=lambda picture: psnr(as_channels(picture), made.truth[0]))
+    return Trial(name=name, inputs=inputs, quality=lambda image: psnr(as_channels(image), made.truth[0]))
 
 
 def recorded(real: RealBurst) -> Trial:
     """Return the real burst, judged by what it shows of the finest bars."""
 
-    def quality(picture: NDArray[np.float32]) -> float:
-        elements = Shown(as_channels(picture)[..., 0], Canvas.over(FIELD, SCALE)).elements()
+    def quality(image: NDArray[np.float32]) -> float:
+        elements = Shown(as_channels(image)[..., 0], Canvas.over(FIELD, SCALE)).elements()
         finest = [float(row["modulation"]) for row in elements if row["group"] == FINEST_GROUP]
         return 20 * math.log10(max(statistics.mean(finest), 1e-6))
 
@@ -184,9 +184,9 @@ def recorded(real: RealBurst) -> Trial:
     return Trial(name="real burst, modulation", inputs=inputs, quality=quality)
 
 
-def as_channels(picture: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a picture as (H, W, C), black where nothing is known, as the tables judge it."""
-    known: NDArray[np.float32] = np.nan_to_num(picture)
+def as_channels(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return an image as (H, W, C), black where nothing is known, as the tables judge it."""
+    known: NDArray[np.float32] = np.nan_to_num(image)
     return known if known.ndim == 3 else known[..., None]
 
 
@@ -205,7 +205,7 @@ def compare(trial: Trial, other: Path, repeats: int) -> Pair:
 
 
 def fitted(checkout: Path, source: Path) -> tuple[NDArray[np.float32], float]:
-    """Return the picture that a checkout makes of a burst, in a process of its own, and the seconds that it takes.
+    """Return the image that a checkout makes of a burst, in a process of its own, and the seconds that it takes.
 
     Raises
     ------
@@ -224,7 +224,7 @@ def fitted(checkout: Path, source: Path) -> tuple[NDArray[np.float32], float]:
         package = Path(str(found["package"]))
         if not package.resolve().is_relative_to(checkout.resolve()):
             raise FiberBurstError(f"expected the package of {checkout}; {package} was imported")
-        return found["picture"], float(found["seconds"])
+        return found["image"], float(found["seconds"])
 
 
 if __name__ == "__main__":

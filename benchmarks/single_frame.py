@@ -3,7 +3,7 @@
     python -m benchmarks.single_frame FOLDER        # with burst.tif and background.tif; under a minute
 
 The background image calibrates the bundle; frame 0 of the burst alone is reconstructed with it. Prints the scores of
-Table 4 that one frame has, and draws the picture of docs/bundle.md.
+Table 4 that one frame has, and draws the image of docs/bundle.md.
 """
 
 import argparse
@@ -25,7 +25,7 @@ LABELS = {
     "pyfibrebundle": "PyFibreBundle, one frame",
     "bundle": "napari-fiberburst, one frame with its bundle",
 }
-# What the picture shows, and how well it is kept.
+# What the image shows, and how well it is kept.
 DRAWN = ("captured", "pyfibrebundle", "bundle")
 QUALITY = 80
 
@@ -34,7 +34,7 @@ def main() -> None:
     """Measure, print, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--picture", type=Path, help="a .webp file to draw")
+    parser.add_argument("--image", type=Path, help="a .webp file to draw")
     parser.add_argument("--device", default="auto")
     options = parser.parse_args()
     real = RealBurst.read(options.folder, options.device)
@@ -45,14 +45,14 @@ def main() -> None:
     shown["bundle"] = with_bundle(real, bundle)
     honeycomb = shown["captured"][0].ring()
     print("| | M, group 7 | finest element | ring | time |\n|---|---|---|---|---|")
-    for name, (picture, seconds) in shown.items():
-        elements = list(picture.elements())
+    for name, (image, seconds) in shown.items():
+        elements = list(image.elements())
         modulation = np.mean([row["modulation"] for row in elements if row["group"] == 7])
-        ring = 20 * np.log10(picture.ring() / honeycomb)
+        ring = 20 * np.log10(image.ring() / honeycomb)
         print(f"| {LABELS[name]} | {modulation:.2f} | {finest(elements)} | {ring:.1f} dB | {seconds:.1f} s |")
-    if options.picture is not None:
+    if options.image is not None:
         sheet = np.concatenate([part_of(shown[name][0]) for name in DRAWN], axis=1)
-        Image.fromarray(sheet).save(options.picture, quality=QUALITY)
+        Image.fromarray(sheet).save(options.image, quality=QUALITY)
 
 
 def with_bundle(real: RealBurst, bundle: Bundle) -> tuple[Shown, float]:

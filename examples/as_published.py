@@ -23,7 +23,7 @@ rough = reconstruct(
     batch=2048,
     on_progress=lambda report: print(f"step {report.step}: loss {report.loss:.4f}", end="\r"),
 )
-# Steps of the published size let the picture settle.
+# Steps of the published size let the image settle.
 result = reconstruct(simulated.burst, initial=rough, iterations=iterations // 5, learning_rate=1e-4)
 
 truth = simulated.truth[0]

@@ -1,7 +1,7 @@
-"""Where can the picture be trusted? Coverage, uncertainty, and what was filled in.
+"""Where can the image be trusted? Coverage, uncertainty, and what was filled in.
 
 The bundle is a circle and some of its cores are dead, so there are places that hardly any core has looked at.
-Writes evidence.png: the picture with its gaps, filled in, coverage, uncertainty, and how far it really is off.
+Writes evidence.png: the image with its gaps, filled in, coverage, uncertainty, and how far it really is off.
 """
 
 import os

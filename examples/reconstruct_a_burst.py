@@ -1,4 +1,4 @@
-"""Simulate a burst, reconstruct it with nothing set, say how close it comes, and write a picture of before and after.
+"""Simulate a burst, reconstruct it with nothing set, say how close it comes, and write an image of before and after.
 
 Takes some ten seconds on two cores.
 """

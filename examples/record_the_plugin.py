@@ -53,7 +53,7 @@ def main(path: str) -> None:
     durations = [MILLISECONDS_A_FRAME] * (len(frames) - 1) + [MILLISECONDS_AT_END]
     durations[0] = 3 * MILLISECONDS_A_FRAME
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
-    print(f"wrote {path}: {len(frames)} pictures")
+    print(f"wrote {path}: {len(frames)} images")
     viewer.close()
 
 

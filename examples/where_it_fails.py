@@ -1,7 +1,7 @@
 """What goes wrong when a burst does not hold what the method needs, and what it says of that itself.
 
 Five bursts of the same scene: a good one; one that does not move; two frames only; a frame that shows something else;
-and cores so far apart that they miss the detail. Writes failures.png: above, a frame of each; below, the pictures.
+and cores so far apart that they miss the detail. Writes failures.png: above, a frame of each; below, the images.
 """
 
 import os

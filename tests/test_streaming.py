@@ -6,19 +6,19 @@ import weakref
 from napari_fiberburst.streaming import Latest
 
 
-class Picture:
+class Image:
     """Something that can be watched while it is let go."""
 
 
 def test_only_the_newest_item_is_kept_alive():
-    box, pictures = Latest[Picture](), []
+    box, images = Latest[Image](), []
     for _ in range(50):
-        picture = Picture()
-        pictures.append(weakref.ref(picture))
-        box.put(picture)
-    del picture
-    assert [number for number, picture in enumerate(pictures) if picture() is not None] == [49]
-    assert isinstance(box.take(), Picture)
+        image = Image()
+        images.append(weakref.ref(image))
+        box.put(image)
+    del image
+    assert [number for number, image in enumerate(images) if image() is not None] == [49]
+    assert isinstance(box.take(), Image)
     assert box.take() is None
 
 

@@ -28,7 +28,7 @@ def core_intensities(frame: NDArray[np.float32], bundle: Bundle) -> tuple[NDArra
 
 
 def inpaint(frame: NDArray[np.float32], bundle: Bundle, *, steps: int = STEPS, seed: int = 0) -> NDArray[np.float32]:
-    """Return the picture (H, W, C) that a Fourier-feature network draws through one frame's cores."""
+    """Return the image (H, W, C) that a Fourier-feature network draws through one frame's cores."""
     height, width, channels = frame.shape
     generator = torch.Generator().manual_seed(seed)
     sigma = PERIODS_PER_PITCH * max(height, width) / 2 / bundle.pitch
@@ -51,5 +51,5 @@ def inpaint(frame: NDArray[np.float32], bundle: Bundle, *, steps: int = STEPS, s
     grid = (2 * (np.stack([columns, rows], axis=-1) + 0.5) / size - 1).astype(np.float32)
     with torch.inference_mode():
         drawn = torch.cat([network(part) for part in torch.from_numpy(grid).reshape(-1, 2).split(2**15)])
-    picture: NDArray[np.float32] = ((drawn + 1) / 2).reshape(height, width, channels).numpy()
-    return picture
+    image: NDArray[np.float32] = ((drawn + 1) / 2).reshape(height, width, channels).numpy()
+    return image

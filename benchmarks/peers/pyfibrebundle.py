@@ -7,7 +7,7 @@ nothing of this project. It reads an npz and writes one:
 
 In: `frames` (T, H, W, C) and `bundle` (H, W), an even white scene behind the same bundle, both with 1 as full scale
 and black at 0; `centres` (N, 2), the true layout, or none, and then the package finds cores `pitch` apart itself;
-`x`, `y` and `size`: the square of frame 0 to draw, pixels, and `grid`, its pixels a side. Out: `picture` (grid, grid,
+`x`, `y` and `size`: the square of frame 0 to draw, pixels, and `grid`, its pixels a side. Out: `image` (grid, grid,
 C) and `seconds`, which leave out starting Python.
 """
 
@@ -49,9 +49,9 @@ def single_calibration(inputs):
 def one_frame(inputs, calibration):
     """Interpolate between the cores of frame 0."""
     channels = np.moveaxis(inputs["frames"][0], -1, 0)
-    pictures = [pybundle.recon_tri_interp(channel, calibration, numba=False) for channel in channels]
+    images = [pybundle.recon_tri_interp(channel, calibration, numba=False) for channel in channels]
     # What is normalised comes with 255 as full scale.
-    return filled(np.stack(pictures, axis=-1) / 255, calibration)
+    return filled(np.stack(images, axis=-1) / 255, calibration)
 
 
 def all_frames(inputs, calibration):
@@ -70,7 +70,7 @@ def all_frames(inputs, calibration):
     shifts = SuperRes.get_shifts(np.stack(drawn, axis=-1), templateSize=grid // 4, refSize=grid // 2, upsample=4)
     shifts = np.asarray(shifts, float) * 2 * half / grid
     centre = {"centreX": inputs["x"] + half, "centreY": inputs["y"] + half, "radius": half}
-    pictures = []
+    images = []
     for channel in range(stacks.shape[3]):
         combined = SuperRes.calib_multi_tri_interp(
             inputs["bundle"],
@@ -83,15 +83,15 @@ def all_frames(inputs, calibration):
             mask=False,
             **centre,
         )
-        pictures.append(SuperRes.recon_multi_tri_interp(stacks[..., channel], combined, numba=False))
-    return filled(np.stack(pictures, axis=-1), combined)
+        images.append(SuperRes.recon_multi_tri_interp(stacks[..., channel], combined, numba=False))
+    return filled(np.stack(images, axis=-1), combined)
 
 
-def filled(picture, calibration):
+def filled(image, calibration):
     """Fill what lies beyond the outermost cores with what is nearest: the package leaves it black."""
-    missing = (calibration.mapping < 0).reshape(picture.shape[:2]) | ~np.isfinite(picture).all(axis=-1)
+    missing = (calibration.mapping < 0).reshape(image.shape[:2]) | ~np.isfinite(image).all(axis=-1)
     rows, columns = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return picture[rows, columns]
+    return image[rows, columns]
 
 
 def main():
@@ -100,9 +100,9 @@ def main():
     with np.load(given) as file:
         inputs = {name: file[name] for name in file.files}
     start = time.perf_counter()
-    picture = {"single": one_frame, "super": all_frames}[method](inputs, single_calibration(inputs))
+    image = {"single": one_frame, "super": all_frames}[method](inputs, single_calibration(inputs))
     seconds = time.perf_counter() - start
-    np.savez(wanted, picture=picture.astype(np.float32), seconds=seconds)
+    np.savez(wanted, image=image.astype(np.float32), seconds=seconds)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Train the supervised peer on simulated pairs: a frame through a bundle, and the scene it saw.
 
 The scenes are random leaves (Lee et al., 2001: opaque discs of all sizes, which have the statistics of natural
-pictures) and photographs of scikit-image that no benchmark shows. Bundles have pitches from 2.6 to 8, and both physics.
+images) and photographs of scikit-image that no benchmark shows. Bundles have pitches from 2.6 to 8, and both physics.
 On two cores with nothing else to do it takes under 20 minutes; the same seed gives the same pairs in the same order.
 """
 
@@ -40,15 +40,15 @@ PHOTOGRAPHS = (
 
 
 def leaves(rng: Generator, side: int) -> NDArray[np.float32]:
-    """Return a grey picture of opaque discs, the newest on top; radii fall off with their third power."""
-    picture = np.full((side, side), rng.random(), np.float32)
+    """Return a grey image of opaque discs, the newest on top; radii fall off with their third power."""
+    image = np.full((side, side), rng.random(), np.float32)
     rows, columns = np.ogrid[:side, :side]
     for _ in range(600):
         radius = 2.0 / np.sqrt(rng.uniform((2.0 / (side / 3)) ** 2, 1))
         x, y = rng.uniform(-radius, side + radius, 2)
         inside = (columns - x) ** 2 + (rows - y) ** 2 <= radius**2
-        picture[inside] = rng.beta(0.6, 0.6) + rng.normal(0, 0.02)
-    return np.clip(picture, 0, 1)
+        image[inside] = rng.beta(0.6, 0.6) + rng.normal(0, 0.02)
+    return np.clip(image, 0, 1)
 
 
 def photograph(rng: Generator, side: int) -> NDArray[np.float32]:
@@ -64,10 +64,10 @@ def make_pairs(count: int, rng: Generator) -> tuple[Tensor, Tensor]:
     """Return frames and the scenes they saw, each (count, 1, SIDE, SIDE)."""
     frames, truths = [], []
     for number in range(count):
-        picture = (leaves if number % 2 else photograph)(rng, SIDE)
-        shape = (min(SIDE, picture.shape[0]), min(SIDE, picture.shape[1]))
+        image = (leaves if number % 2 else photograph)(rng, SIDE)
+        shape = (min(SIDE, image.shape[0]), min(SIDE, image.shape[1]))
         simulated = simulate(
-            Scene(picture[..., None]),
+            Scene(image[..., None]),
             shape=shape,
             frames=2,
             pitch=float(rng.uniform(2.6, 8)),

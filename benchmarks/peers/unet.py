@@ -71,5 +71,5 @@ def clean(frame: NDArray[np.float32], network: UNet) -> NDArray[np.float32]:
     channels = torch.from_numpy(np.ascontiguousarray(frame.transpose(2, 0, 1)))[:, None]
     with torch.inference_mode():
         found = network(functional.pad(channels, padding, mode="replicate"))
-    picture: NDArray[np.float32] = found[:, 0, :height, :width].numpy().transpose(1, 2, 0)
-    return picture
+    image: NDArray[np.float32] = found[:, 0, :height, :width].numpy().transpose(1, 2, 0)
+    return image

@@ -1,4 +1,4 @@
-"""One clean, sharper picture from a burst of frames through a fibre bundle.
+"""One clean, sharper image from a burst of frames through a fibre bundle.
 
 The public names load on first use, so that importing the package costs neither torch nor Qt.
 """

@@ -10,7 +10,7 @@ class BurstError(FiberBurstError):
 
 
 class BundleError(FiberBurstError):
-    """A bundle, or the file or picture it comes from, cannot be used, or does not fit the burst."""
+    """A bundle, or the file or image it comes from, cannot be used, or does not fit the burst."""
 
 
 class SettingsError(FiberBurstError):

@@ -9,7 +9,7 @@ Item = TypeVar("Item")
 class Latest(Generic[Item]):
     """Holds the newest item put into it until it is taken.
 
-    A queue between a fit and a window would grow by a picture with every report the window is too slow for.
+    A queue between a fit and a window would grow by an image with every report the window is too slow for.
 
     Examples
     --------

@@ -81,7 +81,7 @@ def test_one_run_at_a_time_writes_into_a_folder(tmp_path):
 
 def test_results_are_not_overwritten_unasked(tmp_path):
     with Recorder(tmp_path, "quick") as recorder:
-        recorder.row(SCENES, "a", "default", lambda: {"psnr": 1.0, "picture": np.zeros((5, 7))})
+        recorder.row(SCENES, "a", "default", lambda: {"psnr": 1.0, "image": np.zeros((5, 7))})
     with pytest.raises(OutputError, match=r"--resume goes on with them, --overwrite"):
         Recorder(tmp_path, "quick")
     with pytest.raises(OutputError, match="name another folder"):
@@ -89,13 +89,13 @@ def test_results_are_not_overwritten_unasked(tmp_path):
     with Recorder(tmp_path, "full", overwrite=True) as emptied:
         left = emptied.results
     assert left.rows(SCENES) == []
-    assert left.picture(SCENES, "a", "default") is None
+    assert left.image(SCENES, "a", "default") is None
     assert left.about["mode"] == "full"
 
 
 def test_every_row_says_where_it_came_from(tmp_path):
     with Recorder(tmp_path, "quick") as recorder:
-        compare(recorder, CONDITIONS, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=False)
+        compare(recorder, CONDITIONS, [SMALL], ["captured", "gaussian-fixed"], Effort(), images=False)
     for row in recorder.results.rows(CONDITIONS):
         assert row["burst"]["seed"] == 3
         assert row["date"] >= "2026"
@@ -119,7 +119,7 @@ def test_rows_of_another_machine_are_said_to_be_so(tmp_path, monkeypatch):
 def test_a_peer_that_is_missing_has_its_row(tmp_path, monkeypatch):
     monkeypatch.setattr(methods, "PEER_PYTHON", tmp_path / "no python")
     with Recorder(tmp_path, "quick") as recorder:
-        compare(recorder, SCENES, [SMALL], ["captured", "pyfibrebundle"], Effort(), pictures=True)
+        compare(recorder, SCENES, [SMALL], ["captured", "pyfibrebundle"], Effort(), images=True)
     tables = report.write(recorder.results).read_text(encoding="utf-8")
     assert "not installed: make peers" in tables
     assert "captured frame" in tables
@@ -180,8 +180,8 @@ def test_the_methods_draw_frame_0_and_the_best_is_ours():
     quality = {}
     for name in ("captured", "gaussian", "gaussian-fixed", "mean", "unet", "inpainting", "default", "oracle"):
         outcome = METHODS[name].run(case, simulated, Effort(inpainting_steps=150))
-        assert outcome.picture.shape == truth.shape
-        quality[name] = psnr(outcome.picture, truth)
+        assert outcome.image.shape == truth.shape
+        quality[name] = psnr(outcome.image, truth)
     peers = {name: value for name, value in quality.items() if name not in ("default", "oracle")}
     assert quality["captured"] == min(quality.values())
     assert quality["gaussian"] >= quality["gaussian-fixed"]
@@ -208,10 +208,10 @@ def test_time_to_quality_takes_previews_into_account():
 @pytest.fixture(scope="module")
 def drawn_chart():
     """Bars of a known contrast at the known places: dark 50, glass 150, bars of G7E6 at half the depth."""
-    picture = np.full(chart.FRAME, 150.0)
+    image = np.full(chart.FRAME, 150.0)
     rows, columns = np.indices(chart.FRAME)
     x, y, half = chart.SQUARE
-    picture[np.hypot(columns - x, rows - y) < 1.5 * half] = 50
+    image[np.hypot(columns - x, rows - y) < 1.5 * half] = 50
     for (group, element, bars), (x, y) in PLACES.items():
         period = period_of(group, element)
         cosine, sine = np.cos(chart.ANGLE), np.sin(chart.ANGLE)
@@ -222,8 +222,8 @@ def drawn_chart():
         inside = (np.abs(along) < 1.25 * period) & (np.abs(across) < 1.3 * period)
         depth = 50 if (group, element) == (7, 6) else 100
         dark = inside & (np.abs(across / period - np.rint(across / period)) < 0.25)
-        picture[dark] = 150 - depth
-    return picture
+        image[dark] = 150 - depth
+    return image
 
 
 def test_the_chart_is_read_as_it_was_drawn(drawn_chart):
@@ -265,7 +265,7 @@ def test_the_report_is_valid_where_little_is_there(tmp_path):
 def measured(tmp_path):
     """Return a results folder with two methods of the first table."""
     with Recorder(tmp_path / "results", "quick") as recorder:
-        compare(recorder, SCENES, [SMALL], ["captured", "gaussian-fixed"], Effort(), pictures=True)
+        compare(recorder, SCENES, [SMALL], ["captured", "gaussian-fixed"], Effort(), images=True)
     return recorder.results
 
 

@@ -1,4 +1,4 @@
-"""A change beside the checkout from before it: the same code costs nothing, worse pictures are refused."""
+"""A change beside the checkout from before it: the same code costs nothing, worse images are refused."""
 
 import sys
 

@@ -66,8 +66,8 @@ def test_with_a_bundle_one_frame_is_a_burst(probe, scene, channels, gain, frames
     seen = probe(scene, channels=channels, frames=frames)
     result = reconstruct(seen.burst, bundle=seen.bundle, fill=True, device="cpu")
     assert result.image.shape == seen.truth.shape[1:]
-    picture = result.image / np.float32(seen.burst.white_level)
-    assert psnr(picture, seen.truth[0]) > best_gaussian(seen.burst.frames[0], seen.truth[0]) + gain
+    image = result.image / np.float32(seen.burst.white_level)
+    assert psnr(image, seen.truth[0]) > best_gaussian(seen.burst.frames[0], seen.truth[0]) + gain
 
 
 def test_one_frame_without_time_axis_is_a_burst_too(probe):
@@ -223,17 +223,17 @@ def test_a_bundle_serves_recordings_of_other_levels(probe):
     np.testing.assert_allclose(second - 40, first, atol=0.3)
 
 
-def test_the_picture_of_a_bundle_marks_dead_and_saturated_cores(flat_bundle):
+def test_the_image_of_a_bundle_marks_dead_and_saturated_cores(flat_bundle):
     marked = replace(
         flat_bundle,
         dead=np.array([[30.0, 40.0]]),
         saturated=np.arange(len(flat_bundle.centres)) == flat_bundle.labels[60, 60],
     )
-    picture = marked.picture()
-    assert picture.shape == (109, 127, 3)
-    blue, red = picture[40, 30].astype(int), picture[flat_bundle.labels == flat_bundle.labels[60, 60]].astype(int)
+    image = marked.to_image()
+    assert image.shape == (109, 127, 3)
+    blue, red = image[40, 30].astype(int), image[flat_bundle.labels == flat_bundle.labels[60, 60]].astype(int)
     assert blue[2] > 2 * blue[0]
     assert (red[:, 0] >= red[:, 1]).all()
     assert red[:, 0].sum() > 2 * red[:, 1].sum()
-    plain = flat_bundle.picture()[flat_bundle.labels == flat_bundle.labels[20, 20]]
+    plain = flat_bundle.to_image()[flat_bundle.labels == flat_bundle.labels[20, 20]]
     assert (plain == plain[:, :1]).all()

@@ -56,12 +56,12 @@ def test_the_pitch_of_a_bundle_of_many_grains_is_found():
         pitch=pitch,
         crosstalk=0.0,
     )
-    picture = torch.from_numpy(bundle.transmission(shape)).float()
-    assert find_pitch(picture) == pytest.approx(pitch, rel=0.03)
+    image = torch.from_numpy(bundle.transmission(shape)).float()
+    assert find_pitch(image) == pytest.approx(pitch, rel=0.03)
 
 
 @pytest.mark.parametrize("scene", ["histology", "retina", "usaf", "tissue", "cat"])
-def test_a_plain_picture_has_no_pitch(scene, rng):
+def test_a_plain_image_has_no_pitch(scene, rng):
     truth = simulate(scene, shape=(150, 131), frames=3).truth.mean(axis=(0, 3))
     noisy = torch.from_numpy(truth + rng.normal(0, 0.01, truth.shape)).float()
     assert find_pitch(noisy) is None

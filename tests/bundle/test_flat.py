@@ -1,4 +1,4 @@
-"""A bundle is calibrated from pictures in even light, against bundles that the simulator knows."""
+"""A bundle is calibrated from images in even light, against bundles that the simulator knows."""
 
 from dataclasses import replace
 from importlib.metadata import version
@@ -82,7 +82,7 @@ def test_more_flats_leave_less_noise_in_the_gains(simulated):
     assert np.median(many.gain_weights) == pytest.approx(16 * np.median(few.gain_weights), rel=0.1)
 
 
-def test_a_dark_picture_gives_black_level_and_each_cores_own_light(simulated, rng):
+def test_a_dark_image_gives_black_level_and_each_cores_own_light(simulated, rng):
     camera = Camera(bits=16, pedestal=0.03)
     own = rng.uniform(0, 0.2, len(simulated.bundle.centres)) * (simulated.bundle.gains > 0)
     glow = (simulated.bundle.profiles(SHAPE) @ own).reshape(SHAPE)
@@ -99,7 +99,7 @@ def test_a_dark_picture_gives_black_level_and_each_cores_own_light(simulated, rn
     assert gain_error(bundle, simulated.transmission) < 0.01
 
 
-def test_one_frame_behind_glowing_cores_is_clean_with_a_dark_picture(simulated, rng):
+def test_one_frame_behind_glowing_cores_is_clean_with_a_dark_image(simulated, rng):
     own = rng.uniform(0, 0.3, len(simulated.bundle.centres)) * (simulated.bundle.gains > 0)
     glow = (simulated.bundle.profiles(SHAPE) @ own).reshape(SHAPE)
     frame = photographed(0.6 * simulated.burst.frames[0] + glow[..., None])
@@ -139,7 +139,7 @@ def test_saturated_cores_are_named(simulated):
 
 
 @pytest.mark.parametrize("ending", ["tif", "png", "npy"])
-def test_pictures_are_read_from_files_and_named(tmp_path, simulated, ending):
+def test_images_are_read_from_files_and_named(tmp_path, simulated, ending):
     flat = photographed(0.8 * simulated.transmission, Camera(bits=8))
     path = tmp_path / f"flat.{ending}"
     {"tif": tifffile.imwrite, "png": lambda file, array: Image.fromarray(array).save(file), "npy": np.save}[ending](
@@ -198,7 +198,7 @@ def test_a_flat_that_cannot_be_one_is_refused(simulated, spoil, said):
     ],
     ids=["brighter", "another size", "nan"],
 )
-def test_a_dark_picture_that_cannot_be_one_is_refused(simulated, spoil, said):
+def test_a_dark_image_that_cannot_be_one_is_refused(simulated, spoil, said):
     flat = flat_of(simulated)
     with pytest.raises(BundleError, match=said):
         Bundle.from_image(flat, dark=spoil(flat))
@@ -215,7 +215,7 @@ def test_files_that_cannot_be_used_are_named(tmp_path, simulated):
         (torn, "torn.tif"),
         (words, "words.npy"),
         (tmp_path / "none.tif", "none.tif"),
-        (tmp_path, "expected the file of a picture"),
+        (tmp_path, "expected the file of an image"),
         ([good, small], "small.tif has 128 x 153"),
     ):
         with pytest.raises(BundleError, match=said):

@@ -110,7 +110,7 @@ def test_another_size_is_refused_before_anything_is_computed(probe):
 
 
 @pytest.mark.parametrize("frames", [1, 2])
-def test_a_picture_behind_a_moved_bundle_is_nearly_as_good(probe, frames):
+def test_an_image_behind_a_moved_bundle_is_nearly_as_good(probe, frames):
     still = probe(frames=frames)
     moved = probe(frames=frames, **AWAY)
     first, second = (reconstruct(seen.burst, bundle=seen.bundle, fill=True, device="cpu") for seen in (still, moved))

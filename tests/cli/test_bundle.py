@@ -18,7 +18,7 @@ def simulated():
 
 @pytest.fixture
 def files(simulated, tmp_path, monkeypatch):
-    """Lay a burst, one frame of it, an even flat and a dark picture into the working folder."""
+    """Lay a burst, one frame of it, an even flat and a dark image into the working folder."""
     monkeypatch.chdir(tmp_path)
     frames = np.rint(simulated.burst.frames[..., 0] * 255).astype(np.uint8)
     flat = np.rint(200 * simulated.transmission).astype(np.uint8)
@@ -55,7 +55,7 @@ def test_calibrate_says_what_it_has_found(files, capsys, simulated):
     ],
     ids=str,
 )
-def test_calibrate_takes_pictures_in_even_light_or_a_burst(files, given, source, frames):
+def test_calibrate_takes_images_in_even_light_or_a_burst(files, given, source, frames):
     assert main(["calibrate", *given, "-o", "probe.bundle", "--device", "cpu"]) == 0
     told = Bundle.load("probe.bundle").provenance
     assert (told["source"], told["frames"]) == (source, frames)
@@ -107,17 +107,17 @@ def test_info_tells_and_draws_a_bundle(files, capsys):
     told = capsys.readouterr().out.splitlines()[:-1]
     assert main(["info", "probe.bundle", "-o", "probe.png"]) == 0
     assert capsys.readouterr().out.splitlines() == [*told, "wrote probe.png"]
-    np.testing.assert_array_equal(imread("probe.png"), Bundle.load("probe.bundle").picture())
+    np.testing.assert_array_equal(imread("probe.png"), Bundle.load("probe.bundle").to_image())
 
 
 @pytest.mark.parametrize("given", ["--bundle probe.bundle", "--bundle flat.tif", "--calibration flat.tif"])
 def test_one_frame_is_reconstructed_with_a_bundle(files, given, capsys, simulated):
     main(["calibrate", "flat.tif", "-o", "probe.bundle", "--device", "cpu"])
     assert main(["reconstruct", "frame.tif", "-o", "clean.ome.tif", *given.split(), "--device", "cpu"]) == 0
-    picture, truth = tifffile.imread("clean.ome.tif"), simulated.truth[0, ..., 0]
-    seen = np.isfinite(picture)
+    image, truth = tifffile.imread("clean.ome.tif"), simulated.truth[0, ..., 0]
+    seen = np.isfinite(image)
     raw = tifffile.imread("frame.tif")
-    clean, dirty = (np.corrcoef(image[seen], truth[seen])[0, 1] for image in (picture, raw))
+    clean, dirty = (np.corrcoef(values[seen], truth[seen])[0, 1] for values in (image, raw))
     assert clean > 0.9
     assert clean > dirty + 0.3
     assert "finished after" in capsys.readouterr().out

@@ -37,18 +37,18 @@ def test_info_tells_what_a_burst_holds(burst_file, capsys):
     assert "uint8" in told
 
 
-def test_reconstruct_writes_a_picture(burst_file, tmp_path, capsys):
-    out = tmp_path / "picture.ome.tif"
+def test_reconstruct_writes_an_image(burst_file, tmp_path, capsys):
+    out = tmp_path / "image.ome.tif"
     assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "5", *SMALL]) == 0
     assert tifffile.imread(out).shape == (3, 33, 41)
     assert "finished after 5 steps" in capsys.readouterr().out
 
 
 def test_reconstruct_takes_a_crop_and_settings_by_name(burst_file, tmp_path):
-    out = tmp_path / "picture.ome.tif"
+    out = tmp_path / "image.ome.tif"
     command = ["reconstruct", str(burst_file), "-o", str(out), "--crop", "5:25,10:40", "--encoding", "nerf"]
     assert main([*command, "--highest-octave", "3", "--iterations", "2", "--seed", "7", *SMALL]) == 0
-    told = json.loads((tmp_path / "picture.json").read_text())
+    told = json.loads((tmp_path / "image.json").read_text())
     assert tifffile.imread(out).shape == (3, 20, 30)
     assert told["burst"]["origin"] == [5, 10]
     assert told["settings"]["method"]["encoding"] == {"name": "nerf", "highest_octave": 3}
@@ -69,12 +69,12 @@ def test_reconstruct_can_write_the_networks(burst_file, tmp_path):
         (["--crop", "0:99,0:20"], "within 0:33"),
         (["--device", "cuda:77"], "is not on this machine"),
         (["--iterations", "0"], "at least 1"),
-        (["-o", "nowhere/picture.tif"], "does not exist"),
-        (["-o", "picture.bmp"], "ending in"),
+        (["-o", "nowhere/image.tif"], "does not exist"),
+        (["-o", "image.bmp"], "ending in"),
     ],
 )
 def test_bad_input_says_why_and_leaves_no_file(burst_file, tmp_path, capsys, change, said):
-    out = [] if "-o" in change else ["-o", str(tmp_path / "picture.tif")]
+    out = [] if "-o" in change else ["-o", str(tmp_path / "image.tif")]
     assert main(["reconstruct", str(burst_file), *out, *change]) == 2
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [burst_file]
@@ -98,10 +98,10 @@ def test_ctrl_c_while_saving_lets_the_saving_end(burst_file, tmp_path, monkeypat
 
     seen = []
     monkeypatch.setattr(os, "fsync", interrupted)
-    out = tmp_path / "picture.tif"
+    out = tmp_path / "image.tif"
     assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "2", *SMALL]) == 0
     assert out.exists()
-    assert (tmp_path / "picture.json").exists()
+    assert (tmp_path / "image.json").exists()
 
 
 def test_a_missing_burst_is_said(tmp_path, capsys):
@@ -140,7 +140,7 @@ def test_help_comes_from_the_settings(capsys):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
 def test_ctrl_c_writes_what_there_is(burst_file, tmp_path):
-    out = tmp_path / "picture.ome.tif"
+    out = tmp_path / "image.ome.tif"
     command = ["reconstruct", str(burst_file), "-o", str(out), "--iterations", "1000000", *SMALL]
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     process = subprocess.Popen(
@@ -190,9 +190,9 @@ def test_the_demo_prints_its_figures_and_draws(tmp_path, monkeypatch, capsys):
         assert line in told
     from imageio.v3 import imread
 
-    picture = imread(out)
-    assert picture.shape[1] == 4 * 113 + 3 * 8
-    assert picture.std() > 20
+    image = imread(out)
+    assert image.shape[1] == 4 * 113 + 3 * 8
+    assert image.std() > 20
 
 
 def test_the_demo_refuses_a_place_it_cannot_write(tmp_path, capsys):

@@ -111,7 +111,7 @@ def test_a_crop_remembers_where_it_was(rng):
 
 
 @pytest.mark.parametrize("rows", [(-1, 20), (0, 41), (20, 20), (30, 20)])
-def test_a_crop_outside_the_picture_is_refused(rng, rows):
+def test_a_crop_outside_the_image_is_refused(rng, rows):
     with pytest.raises(BurstError, match="within 0:40"):
         Burst(stack(rng, (3, 40, 50))).crop(rows, (0, 50))
 
@@ -131,10 +131,10 @@ def test_levels_and_crops_that_leave_nothing_to_see_are_refused(rng):
 
 
 @pytest.mark.parametrize(
-    ("picture", "axes", "shape"), [((17, 23), None, (1, 17, 23, 1)), ((17, 23, 3), "YXC", (1, 17, 23, 3))]
+    ("image", "axes", "shape"), [((17, 23), None, (1, 17, 23, 1)), ((17, 23, 3), "YXC", (1, 17, 23, 3))]
 )
-def test_one_picture_is_a_burst_of_one_frame(rng, picture, axes, shape):
-    burst = Burst(stack(rng, picture), axes=axes)
+def test_one_image_is_a_burst_of_one_frame(rng, image, axes, shape):
+    burst = Burst(stack(rng, image), axes=axes)
     assert burst.shape == shape
     assert burst.axes == "TYX" + ("C" if shape[3] > 1 else "")
 

@@ -198,7 +198,7 @@ def test_png_of_16_bits_and_with_alpha(tmp_path, rng):
 
 
 def test_colour_png_of_16_bits_is_refused_rather_than_rounded(tmp_path):
-    # The smallest such picture: one black pixel.
+    # The smallest such image: one black pixel.
     def chunk(name, data):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
@@ -348,7 +348,7 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
         ("text.npz", "cannot be read as npz"),
         ("burst.avi", "of no kind that can be read"),
         ("empty", "holds no frames"),
-        ("broken", "0.png cannot be read as a picture"),
+        ("broken", "0.png cannot be read as an image"),
         ("ragged", r"all frames need one size.*1.png has \(16, 23\)"),
         ("mixed", "2.png has .* uint16"),
         ("several.npz", "named 'frames'; it has a, b"),

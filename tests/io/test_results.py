@@ -16,51 +16,51 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.results import check_output, sidecar_of, write_whole
 
 
-def test_a_picture_with_its_provenance_beside_it(fit, tiny_burst, tmp_path):
+def test_an_image_with_its_provenance_beside_it(fit, tiny_burst, tmp_path):
     result = fit(tiny_burst)
-    assert result.save(tmp_path / "picture.ome.tif") == tmp_path / "picture.ome.tif"
-    with tifffile.TiffFile(tmp_path / "picture.ome.tif") as file:
+    assert result.save(tmp_path / "image.ome.tif") == tmp_path / "image.ome.tif"
+    with tifffile.TiffFile(tmp_path / "image.ome.tif") as file:
         assert file.is_ome
         assert file.series[0].axes == "CYX"
         np.testing.assert_array_equal(np.moveaxis(file.asarray(), 0, 2), result.image)
-    told = json.loads((tmp_path / "picture.json").read_text())
+    told = json.loads((tmp_path / "image.json").read_text())
     assert told["settings"] == result.settings.to_dict()
     assert told["homographies"] == result.homographies.tolist()
     assert told["losses"] == [float(loss) for loss in result.losses]
     assert told["seed"] == 0
     assert set(told["versions"]) >= {"python", "numpy", "torch", "napari-fiberburst"}
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["picture.json", "picture.ome.tif"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["image.json", "image.ome.tif"]
 
 
 def test_pixel_size_and_channel_names_go_along(fit, rng, tmp_path):
     burst = Burst(rng.random((3, 17, 23, 2)), pixel_size=(0.75, 0.5), unit="nm", channel_names=["a", "b"])
-    fit(burst).save(tmp_path / "picture.ome.tif")
-    with tifffile.TiffFile(tmp_path / "picture.ome.tif") as file:
+    fit(burst).save(tmp_path / "image.ome.tif")
+    with tifffile.TiffFile(tmp_path / "image.ome.tif") as file:
         pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]
     assert (pixels["PhysicalSizeY"], pixels["PhysicalSizeX"]) == (0.75, 0.5)
     assert pixels["PhysicalSizeXUnit"] == "nm"
     assert [channel["Name"] for channel in pixels["Channel"]] == ["a", "b"]
 
 
-def test_a_grey_picture_is_a_plane(fit, rng, tmp_path):
-    fit(rng.random((3, 17, 23))).save(tmp_path / "picture.tif")
-    assert tifffile.imread(tmp_path / "picture.tif").shape == (17, 23)
-    assert (tmp_path / "picture.json").exists()
+def test_a_grey_image_is_a_plane(fit, rng, tmp_path):
+    fit(rng.random((3, 17, 23))).save(tmp_path / "image.tif")
+    assert tifffile.imread(tmp_path / "image.tif").shape == (17, 23)
+    assert (tmp_path / "image.json").exists()
 
 
 @pytest.mark.parametrize(
     ("name", "beside"), [("a.ome.tif", "a.json"), ("a.b.TIF", "a.b.json"), ("a.ome.tiff", "a.json")]
 )
-def test_the_sidecar_has_the_pictures_name(tmp_path, name, beside):
+def test_the_sidecar_has_the_images_name(tmp_path, name, beside):
     assert sidecar_of(tmp_path / name) == tmp_path / beside
 
 
 @pytest.mark.parametrize(
     ("place", "said"),
     [
-        ("missing/picture.tif", "does not exist; make it first"),
-        ("picture.jpg", "ending in .ome.tif"),
-        ("picture", "ending in .ome.tif"),
+        ("missing/image.tif", "does not exist; make it first"),
+        ("image.jpg", "ending in .ome.tif"),
+        ("image", "ending in .ome.tif"),
         ("folder.tif", "is a folder"),
     ],
 )
@@ -105,7 +105,7 @@ def test_the_source_of_a_result_is_not_replaced(tmp_path):
         check_output(tmp_path / "burst.tif", source=tmp_path / "burst.tif")
 
 
-def test_a_picture_and_its_provenance_appear_together_or_not_at_all(fit, tiny_burst, tmp_path, monkeypatch):
+def test_an_image_and_its_provenance_appear_together_or_not_at_all(fit, tiny_burst, tmp_path, monkeypatch):
     result = fit(tiny_burst)
     synced = []
 
@@ -116,25 +116,25 @@ def test_a_picture_and_its_provenance_appear_together_or_not_at_all(fit, tiny_bu
 
     monkeypatch.setattr(os, "fsync", fail_at_the_second)
     with pytest.raises(OutputError, match="No space left"):
-        result.save(tmp_path / "picture.tif")
+        result.save(tmp_path / "image.tif")
     names = {path.name for path in tmp_path.iterdir()}
-    assert "picture.tif" not in names
+    assert "image.tif" not in names
     assert not any(name.endswith(".part") for name in names)
 
 
 def test_a_unit_that_ome_does_not_know_stands_in_the_json_alone(fit, rng, tmp_path):
     burst = Burst(rng.random((3, 17, 23)), pixel_size=2, unit="furlong")
-    fit(burst).save(tmp_path / "picture.tif")
-    with tifffile.TiffFile(tmp_path / "picture.tif") as file:
+    fit(burst).save(tmp_path / "image.tif")
+    with tifffile.TiffFile(tmp_path / "image.tif") as file:
         assert "PhysicalSize" not in file.ome_metadata
-    assert json.loads((tmp_path / "picture.json").read_text())["burst"]["unit"] == "furlong"
+    assert json.loads((tmp_path / "image.json").read_text())["burst"]["unit"] == "furlong"
 
 
 def test_a_folder_without_permission_is_refused(tmp_path, monkeypatch):
     # The superuser may write anywhere, so the answer of the system is stood in for.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     with pytest.raises(OutputError, match="cannot be written; choose another"):
-        check_output(tmp_path / "picture.tif")
+        check_output(tmp_path / "image.tif")
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -179,6 +179,6 @@ def test_a_killed_run_leaves_no_half_file(tmp_path):
     assert not path.exists()
 
 
-def test_a_saved_picture_is_a_burst_of_one_frame(fit, rng, tmp_path):
-    fit(rng.random((3, 17, 23))).save(tmp_path / "picture.tif")
-    assert read_burst(tmp_path / "picture.tif").shape == (1, 17, 23, 1)
+def test_a_saved_image_is_a_burst_of_one_frame(fit, rng, tmp_path):
+    fit(rng.random((3, 17, 23))).save(tmp_path / "image.tif")
+    assert read_burst(tmp_path / "image.tif").shape == (1, 17, 23, 1)

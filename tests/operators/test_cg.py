@@ -5,7 +5,7 @@ import pytest
 import scipy.sparse.linalg
 import torch
 
-from napari_fiberburst.operators.cg import conjugate_gradients, inner_of_pictures
+from napari_fiberburst.operators.cg import conjugate_gradients, inner_of_images
 from napari_fiberburst.operators.priors import THIN_PLATE
 
 SHAPE = (13, 17)
@@ -44,19 +44,19 @@ def test_blocks_are_one_system_in_parts():
     np.testing.assert_allclose(torch.cat(found), np.linalg.solve(matrix, rhs), rtol=1e-6)
 
 
-def test_pictures_that_share_a_matrix_are_solved_as_if_alone():
+def test_images_that_share_a_matrix_are_solved_as_if_alone():
     rhs = torch.randn(3, *SHAPE, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     rhs[1] *= 1e3
 
-    def solved(pictures):
+    def solved(images):
         (found,) = conjugate_gradients(
             lambda x: (THIN_PLATE(x[0]) + 0.1 * x[0],),
-            (pictures,),
+            (images,),
             lambda r: r,
-            start=(torch.ones_like(pictures),),
+            start=(torch.ones_like(images),),
             iterations=60,
             tolerance=0.0,
-            inner=inner_of_pictures,
+            inner=inner_of_images,
         )
         return found
 

@@ -1,4 +1,4 @@
-"""Pictures are linear between the nodes of a grid; stencil, slopes and filters belong to that."""
+"""Images are linear between the nodes of a grid; stencil, slopes and filters belong to that."""
 
 import pytest
 import torch
@@ -38,19 +38,19 @@ def test_outside_there_is_nothing_to_sample_or_to_splat_on(grid):
 
 
 def test_the_stencil_is_sample_then_weigh_then_splat(grid, points):
-    picture, weights = torch.rand(2, *grid.shape), torch.rand(200)
+    image, weights = torch.rand(2, *grid.shape), torch.rand(200)
     at = grid.at(points)
-    by_stencil = at.normal(weights)(picture)
-    by_hand = torch.stack([at.adjoint(weights * at(part)) for part in picture])
+    by_stencil = at.normal(weights)(image)
+    by_hand = torch.stack([at.adjoint(weights * at(part)) for part in image])
     torch.testing.assert_close(by_stencil, by_hand, rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(at.normal(weights).diagonal, at.normal_diagonal(weights))
 
 
 def test_the_membrane_is_the_slope_of_its_energy():
-    picture = torch.rand(7, 5, dtype=torch.float64, requires_grad=True)
-    energy = ((picture[1:] - picture[:-1]) ** 2).sum() + ((picture[:, 1:] - picture[:, :-1]) ** 2).sum()
+    image = torch.rand(7, 5, dtype=torch.float64, requires_grad=True)
+    energy = ((image[1:] - image[:-1]) ** 2).sum() + ((image[:, 1:] - image[:, :-1]) ** 2).sum()
     energy.backward()
-    torch.testing.assert_close(MEMBRANE(picture.detach()), picture.grad / 2)
+    torch.testing.assert_close(MEMBRANE(image.detach()), image.grad / 2)
 
 
 @pytest.mark.parametrize("prior", [MEMBRANE, THIN_PLATE])
@@ -67,9 +67,9 @@ def test_a_prior_does_to_waves_what_its_response_says(prior):
 
 
 def test_a_blurred_point_is_a_gaussian():
-    picture = torch.zeros(41, 51, dtype=torch.float64)
-    picture[20, 24] = 1
-    spread = blur(picture, 2.5)
+    image = torch.zeros(41, 51, dtype=torch.float64)
+    image[20, 24] = 1
+    spread = blur(image, 2.5)
     offset = torch.arange(51) - 24
     profile = spread[20] / spread[20, 24]
     torch.testing.assert_close(profile, torch.exp(-(offset.double() ** 2) / (2 * 2.5**2)), rtol=0, atol=1e-3)

@@ -43,7 +43,7 @@ def test_nothing_is_left_open_and_the_same_comes_of_it_again(burst, kind):
     again = reconstruct(burst, preset=result.settings)
     assert again.requested == again.settings == result.settings
     if kind == "spline":
-        # The gains come of a first picture, which differs where its smoothness is known from the start.
+        # The gains come of a first image, which differs where its smoothness is known from the start.
         assert np.sqrt(np.nanmean((again.image - result.image) ** 2)) < 0.5  # of 255
         np.testing.assert_allclose(again.homographies, result.homographies, atol=1e-3)
     else:
@@ -108,7 +108,7 @@ def test_a_saved_result_tells_what_was_asked_for_and_what_was_chosen(burst, kind
     result = reconstruct(burst, **{**KINDS[kind], "iterations": 3})
     again = load(result.save(tmp_path / "scene.npz"), device="cpu")
     assert (again.requested, again.settings) == (result.requested, result.settings)
-    result.save(tmp_path / "picture.ome.tif")
-    told = json.loads((tmp_path / "picture.json").read_text(encoding="utf-8"))
+    result.save(tmp_path / "image.ome.tif")
+    told = json.loads((tmp_path / "image.json").read_text(encoding="utf-8"))
     assert Settings.from_dict(told["requested"]) == result.requested
     assert Settings.from_dict(told["settings"]) == result.settings

@@ -1,4 +1,4 @@
-"""Hard and broken bursts: each gives a picture, and says what is wrong with it."""
+"""Hard and broken bursts: each gives an image, and says what is wrong with it."""
 
 import logging
 
@@ -33,7 +33,7 @@ def test_without_motion_it_says_so_and_shows_one_frames_worth():
     simulated = simulate("cat", shape=SHAPE, frames=8, pitch=5.0, physics="core", motion=still_to(8))
     result = reconstruct(simulated.burst)
     assert any("too little to fill the gaps" in note for note in result.notes)
-    # What cores differ by is smoothed out: the picture is as good as the filter that the truth would choose.
+    # What cores differ by is smoothed out: the image is as good as the filter that the truth would choose.
     frame, truth = simulated.burst.frames[0], simulated.truth[0]
     filtered = max(psnr(gaussian_filter(frame, (width, width, 0)), truth) for width in np.arange(1, 6, 0.5))
     assert psnr(np.nan_to_num(result.image, nan=np.nanmean(result.image)), truth) > filtered - 0.3

@@ -45,11 +45,11 @@ def test_any_number_of_channels(fit, rng, channels):
     assert result.frame(1).shape == (17, 23, channels)
 
 
-def test_a_grey_burst_gives_a_grey_picture(fit, rng):
+def test_a_grey_burst_gives_a_grey_image(fit, rng):
     assert fit(rng.random((3, 17, 23))).image.shape == (17, 23)
 
 
-def test_the_picture_is_in_the_units_of_the_burst(fit, rng):
+def test_the_image_is_in_the_units_of_the_burst(fit, rng):
     frames = rng.normal(3000, 20, (3, 17, 23)).astype(np.float32)
     assert fit(frames, iterations=300, learning_rate=1e-2).image.mean() == pytest.approx(3000, rel=0.01)
 

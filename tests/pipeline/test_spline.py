@@ -21,7 +21,7 @@ SHAPE = (127, 141)
         ("tissue", "core", 6.0, 22.0, 0.85, 0.15),
     ],
 )
-def test_pictures_and_motion_come_close_to_the_truth(scene, physics, pitch, least, alike, most_motion):
+def test_images_and_motion_come_close_to_the_truth(scene, physics, pitch, least, alike, most_motion):
     simulated = simulate(scene, shape=SHAPE, frames=16, pitch=pitch, physics=physics, seed=11)
     result = reconstruct(simulated.burst, fill=True)
     truth = simulated.truth[0]
@@ -38,7 +38,7 @@ def test_it_comes_as_close_as_knowing_the_bundle(cores, fitted):
     assert psnr(fitted.image, truth) > psnr(known.image, truth) - 0.5
 
 
-def test_what_is_known_comes_with_the_picture(cores, fitted):
+def test_what_is_known_comes_with_the_image(cores, fitted):
     count = len(fitted.bundle.centres)
     assert fitted.coverage.shape == fitted.uncertainty.shape == SHAPE
     assert fitted.bundle.transmission.shape == SHAPE
@@ -54,7 +54,7 @@ def test_what_is_known_comes_with_the_picture(cores, fitted):
 
 
 def test_uncertainty_is_of_the_size_of_the_noise(cores, fitted):
-    """Two cameras' noise on the same object: their pictures differ by what uncertainty says, about."""
+    """Two cameras' noise on the same object: their images differ by what uncertainty says, about."""
     other = simulate("histology", shape=SHAPE, frames=12, pitch=6.0, physics="core", seed=3, camera=Camera(photons=700))
     noisy = reconstruct(other.burst, fill=True)
     assert np.median(noisy.uncertainty) > np.median(fitted.uncertainty)
@@ -91,7 +91,7 @@ def test_a_saved_scene_draws_the_same_again(cores, fitted, tmp_path):
     assert again.notes == fitted.notes
     assert again.frames_used == fitted.frames_used
     np.testing.assert_allclose(again.frame(5), fitted.frame(5))
-    fitted.save(tmp_path / "picture.ome.tif")
+    fitted.save(tmp_path / "image.ome.tif")
 
 
 def test_frames_are_drawn_as_they_see_the_scene(cores, fitted):
@@ -168,7 +168,7 @@ def test_flow_starts_from_the_registration():
 
 
 @pytest.mark.parametrize("rounds", [3, 9, 16, 27, 30])
-def test_wherever_it_is_stopped_picture_and_motion_belong_together(cores, rounds, tmp_path):
+def test_wherever_it_is_stopped_image_and_motion_belong_together(cores, rounds, tmp_path):
     control = Control()
     result = reconstruct(
         cores.burst, control=control, on_progress=lambda report: report.step >= rounds and control.stop()

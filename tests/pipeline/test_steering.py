@@ -133,14 +133,14 @@ def test_what_broke_a_run_is_not_in_the_settings_it_goes_back_to(fit, tiny_burst
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5])
-def test_a_last_step_that_breaks_the_picture_is_taken_back(fit, tiny_burst, monkeypatch, steps):
+def test_a_last_step_that_breaks_the_image_is_taken_back(fit, tiny_burst, monkeypatch, steps):
     step = Problem.step
 
     def break_at_the_end(self):
         loss = step(self)
         if self.samples.drawn == steps * self.batch:
             for parameter in self.field.scene.parameters():
-                parameter.data.fill_(1e30)  # finite, but no picture
+                parameter.data.fill_(1e30)  # finite, but no image
         return loss
 
     monkeypatch.setattr(Problem, "step", break_at_the_end)

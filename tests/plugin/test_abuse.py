@@ -46,7 +46,7 @@ def test_an_error_in_the_solver_leaves_the_form_ready(open_dock, qtbot, burst_la
     assert not viewer.window._task_status_manager.is_busy()
 
 
-def test_a_picture_without_numbers_is_a_failure(open_dock, qtbot, burst_layer, monkeypatch):
+def test_an_image_without_numbers_is_a_failure(open_dock, qtbot, burst_layer, monkeypatch):
     right = pipeline.reconstruct
 
     def blind(*args, **choices):
@@ -69,7 +69,7 @@ def test_start_twice_is_one_run(open_dock, qtbot, burst_layer):
     assert len(dock.runs.runs) == 1
 
 
-@pytest.mark.parametrize("deed", ["delete burst", "rename burst", "replace data", "delete picture"])
+@pytest.mark.parametrize("deed", ["delete burst", "rename burst", "replace data", "delete image"])
 def test_layers_may_change_while_running(open_dock, qtbot, burst_layer, deed):
     viewer, dock = open_dock(burst_layer)
     with qtbot.waitSignal(dock.runner.previewed, timeout=MILLISECONDS):
@@ -81,12 +81,12 @@ def test_layers_may_change_while_running(open_dock, qtbot, burst_layer, deed):
     elif deed == "replace data":
         burst_layer.data = np.zeros((3, 20, 20, 3), np.uint8)
     else:
-        viewer.layers.remove(viewer.layers["run 1: picture"])
+        viewer.layers.remove(viewer.layers["run 1: image"])
     with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
         pass
     names = [layer.name for layer in viewer.layers]
     assert dock.runs.run.result.ending == "finished"
-    assert ("run 1: picture" in names) == (deed != "delete picture")
+    assert ("run 1: image" in names) == (deed != "delete image")
     assert "run 1: coverage" in names
 
 
@@ -128,7 +128,7 @@ def test_two_docks_run_side_by_side(open_dock, qtbot, burst_layer):
         first.start()
         second.start()
     names = {layer.name for layer in viewer.layers}
-    assert {"run 1: picture", "run 2: picture"} <= names
+    assert {"run 1: image", "run 2: image"} <= names
 
 
 def test_many_starts_and_stops_leave_nothing_behind(open_dock, qtbot, burst_layer):
@@ -151,7 +151,7 @@ def test_many_starts_and_stops_leave_nothing_behind(open_dock, qtbot, burst_laye
 def test_what_a_removed_run_held_is_let_go(open_dock, run_through, qtbot, burst_layer):
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
-    gone = [weakref.ref(run.result), weakref.ref(viewer.layers["run 1: picture"])]
+    gone = [weakref.ref(run.result), weakref.ref(viewer.layers["run 1: image"])]
     dock.runs.remove(run)
     del run
     qtbot.wait(50)

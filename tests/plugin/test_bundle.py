@@ -20,7 +20,7 @@ ROOT = Path(napari_fiberburst.__file__).parent
 
 @pytest.fixture(scope="module")
 def bundle(simulated) -> Bundle:
-    """Return the bundle of the burst, 63 x 75 pixels, from a picture of it in even light."""
+    """Return the bundle of the burst, 63 x 75 pixels, from an image of it in even light."""
     return Bundle.from_image(np.rint(200 * simulated.transmission).astype(np.uint8))
 
 
@@ -31,7 +31,7 @@ def bundle_file(bundle, tmp_path):
 
 @pytest.fixture
 def frame_layer(simulated) -> Image:
-    """Return one frame of the burst as a picture without time."""
+    """Return one frame of the burst as an image without time."""
     return Image(simulated.arrays()["frames"][2], rgb=True, name="frame")
 
 
@@ -90,7 +90,7 @@ def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
     assert second.result.image.shape == (63, 75, 3)
     np.testing.assert_allclose(second.result.bundle.centres, first.result.bundle.centres, atol=0.1)
     assert {layer.name.removeprefix("run 2: ") for layer in viewer.layers if layer.name.startswith("run 2")} == {
-        "picture",
+        "image",
         "coverage",
         "uncertainty",
         "transmission",
@@ -129,7 +129,7 @@ def test_a_bundle_that_was_given_is_kept_improved(open_dock, run_through, burst_
     assert (better.gain_weights > bundle.gain_weights).any()
 
 
-def test_a_picture_in_even_light_is_kept_as_a_bundle_improved(open_dock, run_through, burst_layer, simulated, tmp_path):
+def test_an_image_in_even_light_is_kept_as_a_bundle_improved(open_dock, run_through, burst_layer, simulated, tmp_path):
     even = Image(np.rint(200 * simulated.transmission).astype(np.uint8), name="even")
     _, dock = open_dock(burst_layer, even)
     dock.input.burst.value, dock.input.bundle.value = burst_layer, even
@@ -243,9 +243,9 @@ def test_copied_calls_name_the_bundles_file(open_dock, frame_layer, bundle_file)
     dock.input.open_bundle(bundle_file)
     dock.copying.command.click()
     assert QApplication.clipboard().text().splitlines()[-1] == (
-        f"fiberburst reconstruct burst.tif -o picture.ome.tif --bundle {bundle_file}"
+        f"fiberburst reconstruct burst.tif -o image.ome.tif --bundle {bundle_file}"
     )
     dock.copying.python.click()
     scope = {"viewer": viewer}
-    exec(QApplication.clipboard().text().replace('result.save("picture.ome.tif")\n', ""), scope)
+    exec(QApplication.clipboard().text().replace('result.save("image.ome.tif")\n', ""), scope)
     assert scope["result"].image.shape == (63, 75, 3)

@@ -63,14 +63,14 @@ def test_a_folder_of_frames_opens_as_a_stack(tmp_path, grey_frames):
 
 def test_other_files_are_left_to_other_readers(tmp_path):
     assert contributions.get_reader(str(tmp_path)) is None
-    assert contributions.get_reader(str(tmp_path / "picture.tif")) is None
+    assert contributions.get_reader(str(tmp_path / "image.tif")) is None
     assert contributions.get_reader(["a.npz", "b.npz"]) is None
 
 
 def test_a_result_layer_is_written_with_its_provenance(open_dock, run_through, burst_layer, tmp_path):
     viewer, dock = open_dock(burst_layer)
     run_through(dock)
-    layer = viewer.layers["run 1: picture"]
+    layer = viewer.layers["run 1: image"]
     written = contributions.write(str(tmp_path / "out.ome.tif"), *layer.as_layer_data_tuple()[:2])
     assert written == [str(tmp_path / "out.ome.tif")]
     assert tifffile.imread(written[0]).shape == (3, 63, 75)
@@ -91,7 +91,7 @@ def test_the_layers_menu_registers_and_reconstructs(make_napari_viewer, qtbot, b
     with qtbot.waitSignal(dock.display.complete, timeout=60_000):
         pass
     assert viewer.layers["run 1: stabilised burst"].visible
-    assert not viewer.layers["run 1: picture"].visible
+    assert not viewer.layers["run 1: image"].visible
 
 
 def test_preferences_come_from_naparis_page(plugin_settings, npe2pm):

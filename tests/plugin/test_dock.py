@@ -1,4 +1,4 @@
-"""The dock as a user has it: one click, a picture; and whatever else may happen to it."""
+"""The dock as a user has it: one click, an image; and whatever else may happen to it."""
 
 import numpy as np
 from napari.layers import Image
@@ -11,7 +11,7 @@ NETWORK = {"encoding": "fourier", "iterations": 400, "scene_width": 16, "scene_l
 QUICK = {"preset": "paper", **NETWORK, "iterations": 2}
 
 
-def test_one_click_makes_a_picture(open_dock, run_through, burst_layer, simulated):
+def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated):
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
     assert run.result.ending == "finished"
@@ -22,11 +22,11 @@ def test_one_click_makes_a_picture(open_dock, run_through, burst_layer, simulate
         "run 1: uncertainty",
         "run 1: transmission",
         "run 1: residuals",
-        "run 1: picture",
+        "run 1: image",
         "run 1: frame outlines",
         "run 1: frame centres",
     ]
-    shown = viewer.layers["run 1: picture"].data
+    shown = viewer.layers["run 1: image"].data
     known = np.isfinite(run.result.image).all(axis=-1)
     np.testing.assert_allclose(shown[known][:, :3], np.clip(run.result.image[known] / 255, 0, 1), atol=1e-6)
     np.testing.assert_array_equal(shown[..., 3], known)
@@ -153,12 +153,12 @@ def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_lay
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
     assert len(run.history.entries) >= 2
-    final = viewer.layers["run 1: picture"].data.copy()
+    final = viewer.layers["run 1: image"].data.copy()
     dock.display.slider.setValue(0)
-    early = viewer.layers["run 1: picture"].data
+    early = viewer.layers["run 1: image"].data
     assert not np.array_equal(early, final)
     dock.display.slider.setValue(dock.display.slider.maximum())
-    np.testing.assert_array_equal(viewer.layers["run 1: picture"].data, final)
+    np.testing.assert_array_equal(viewer.layers["run 1: image"].data, final)
 
 
 def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_layer, tmp_path, monkeypatch):
@@ -169,7 +169,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     dock.copying.python.click()
     text = QApplication.clipboard().text()
     run = run_through(dock)
-    assert viewer.layers["run 1: picture"].metadata["fiberburst"]["python"] == text
+    assert viewer.layers["run 1: image"].metadata["fiberburst"]["python"] == text
     monkeypatch.chdir(tmp_path)
     scope = {"viewer": viewer}
     exec(text, scope)
@@ -177,7 +177,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     dock.copying.command.click()
     command = QApplication.clipboard().text()
     assert command.splitlines()[-1] == (
-        "fiberburst reconstruct burst.npz -o picture.ome.tif --motion affine --upsample 2.0"
+        "fiberburst reconstruct burst.npz -o image.ome.tif --motion affine --upsample 2.0"
     )
 
 
@@ -200,8 +200,8 @@ def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     dock.form.set_choices(QUICK)
     run_through(dock)
     dock.runs.list_of_runs.item(0).setText("sharp")
-    assert "sharp: picture" in viewer.layers
-    assert viewer.layers["sharp: picture"].metadata["fiberburst"]["run"] == "sharp"
+    assert "sharp: image" in viewer.layers
+    assert viewer.layers["sharp: image"].metadata["fiberburst"]["run"] == "sharp"
     dock.runs.list_of_runs.item(0).setText(" ")
     assert dock.runs.list_of_runs.item(0).text() == "sharp"
 
@@ -215,7 +215,7 @@ def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_l
     assert [viewer.layers[f"run {number}: frame centres"].visible for number in (1, 2)] == [False, True]
 
 
-def test_comparing_shows_one_picture_alone(open_dock, run_through, burst_layer):
+def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)
     for _ in range(3):
@@ -223,7 +223,7 @@ def test_comparing_shows_one_picture_alone(open_dock, run_through, burst_layer):
     dock.runs.list_of_runs.setCurrentRow(0)
     dock.runs.other.setCurrentIndex(0)
     dock.runs.compare_button.click()
-    assert [viewer.layers[f"run {number}: picture"].visible for number in (1, 2, 3)] == [False, True, False]
+    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 2, 3)] == [False, True, False]
     dock.runs.remove(dock.runs.runs[1])
     assert not dock.runs.compare_button.isChecked()
-    assert [viewer.layers[f"run {number}: picture"].visible for number in (1, 3)] == [True, False]
+    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 3)] == [True, False]

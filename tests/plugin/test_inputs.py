@@ -49,9 +49,9 @@ def test_a_region_limits_the_run(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer, Shapes([corners], shape_type="rectangle", name="look here"))
     dock.input.region.value = viewer.layers["look here"]
     run = run_through(dock)
-    picture = viewer.layers["run 1: picture"]
+    image = viewer.layers["run 1: image"]
     assert run.result.image.shape == (36, 40, 3)
-    np.testing.assert_array_equal(picture.translate, [5, 8])
+    np.testing.assert_array_equal(image.translate, [5, 8])
     assert run.scores.motion_error < 0.7
 
 
@@ -61,14 +61,14 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     viewer, dock = open_dock(layer)
     dock.form.set_choices({"upsample": 2.0})
     run = run_through(dock)
-    picture, still = viewer.layers["run 1: picture"], viewer.layers["run 1: stabilised burst"]
+    image, still = viewer.layers["run 1: image"], viewer.layers["run 1: stabilised burst"]
     assert run.result.acquisition.pixel_size == (0.5, 0.25)
     assert run.result.acquisition.unit == "µm"
-    np.testing.assert_allclose(picture.scale, [0.25, 0.125])
-    np.testing.assert_allclose(picture.translate, [10 - 0.125, 20 - 0.0625])  # pixel edges meet, not centres
-    assert picture.axis_labels == ("y", "x")
+    np.testing.assert_allclose(image.scale, [0.25, 0.125])
+    np.testing.assert_allclose(image.translate, [10 - 0.125, 20 - 0.0625])  # pixel edges meet, not centres
+    assert image.axis_labels == ("y", "x")
     assert still.axis_labels == ("t", "y", "x")
-    assert [str(unit) for unit in picture.units] == ["micrometer", "micrometer"]
+    assert [str(unit) for unit in image.units] == ["micrometer", "micrometer"]
     for own in ("frame outlines", "frame centres"):
         np.testing.assert_allclose(viewer.layers[f"run 1: {own}"].scale, [1, 0.5, 0.25])
 
@@ -79,9 +79,9 @@ def test_channels_that_are_no_colours_stay_an_axis(open_dock, run_through, simul
     viewer, dock = open_dock(Image(frames.transpose(["TYXC".index(axis) for axis in order])))
     assert dock.input.axes.text() == order
     run = run_through(dock)
-    picture = viewer.layers["run 1: picture"]
+    image = viewer.layers["run 1: image"]
     expected = np.moveaxis(run.result.image, 2, 0)
-    shown = picture.data if order == "TCYX" else picture.data[:, 3]
+    shown = image.data if order == "TCYX" else image.data[:, 3]
     np.testing.assert_array_equal(shown, expected)
     assert viewer.layers["run 1: stabilised burst"].data.shape == viewer.layers[0].data.shape
 
@@ -98,7 +98,7 @@ def test_grey_layers_make_one_burst(open_dock, run_through, qtbot, simulated):
     assert run.result.image.shape == (63, 75, 2)
     assert run.result.acquisition.channel_names == names
     for number, name in enumerate(names):
-        np.testing.assert_array_equal(viewer.layers[f"run 1: picture of {name}"].data, run.result.image[..., number])
+        np.testing.assert_array_equal(viewer.layers[f"run 1: image of {name}"].data, run.result.image[..., number])
 
 
 def test_a_dask_layer_is_a_burst(open_dock, run_through, grey_frames):
@@ -128,7 +128,7 @@ def test_a_truth_that_fits_no_longer_is_let_go(open_dock, run_through, burst_lay
 def test_axes_of_length_one_in_front_are_no_hindrance(open_dock, run_through, grey_frames):
     viewer, dock = open_dock(Image(grey_frames[None, None]))
     run = run_through(dock)
-    np.testing.assert_array_equal(viewer.layers["run 1: picture"].data, run.result.image)
+    np.testing.assert_array_equal(viewer.layers["run 1: image"].data, run.result.image)
     assert viewer.layers["run 1: frame centres"].data.shape == (8, 4)
 
 

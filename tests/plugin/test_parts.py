@@ -95,7 +95,7 @@ def test_a_burst_from_a_file_is_called_by_its_path():
     text = as_python(source(path="burst.tif"), {"motion": "affine", "upsample": 2.0})
     assert "reconstruct(\n    'burst.tif',\n    motion='affine',\n    upsample=2.0,\n)" in text
     assert as_command(source(path="my burst.tif"), {"fill": True}) == (
-        "fiberburst reconstruct 'my burst.tif' -o picture.ome.tif --fill\n"
+        "fiberburst reconstruct 'my burst.tif' -o image.ome.tif --fill\n"
     )
 
 
@@ -115,7 +115,7 @@ def test_a_simulated_burst_is_simulated_by_its_command():
     text = as_command(source(recipe={"scene": "cat", "physics": "core"}), {"preset": "paper"})
     assert text.splitlines() == [
         "fiberburst simulate --scene cat --physics core -o burst.npz",
-        "fiberburst reconstruct burst.npz -o picture.ome.tif --preset paper",
+        "fiberburst reconstruct burst.npz -o image.ome.tif --preset paper",
     ]
 
 
@@ -131,7 +131,7 @@ def test_history_keeps_the_first_the_newest_and_an_even_part_between():
     assert len(set(np.diff(seconds[:-1]))) == 1
 
 
-def test_a_turned_layer_has_its_picture_in_the_same_place():
+def test_a_turned_layer_has_its_image_in_the_same_place():
     layer = image(9, 31, 37, rotate=30, scale=(1, 2.0, 2.0), translate=(0, 5, 7))
     placement = Placement.of([layer], "TYX", (3, 4))
     canvas = Canvas.over((0, 0, 20, 20), 2.0)
@@ -144,12 +144,12 @@ def test_a_turned_layer_has_its_picture_in_the_same_place():
 
 def test_arrays_are_put_into_the_order_of_the_layers_axes(rng):
     placement = Placement.of([image(2, 9, 31, 37)], "CTYX", (0, 0))
-    picture = rng.random((31, 37, 2))
-    shown, axes = placement.arrange(picture, "YXC")
+    drawn = rng.random((31, 37, 2))
+    shown, axes = placement.arrange(drawn, "YXC")
     assert axes == "CTYX"
     assert shown.shape == (2, 9, 31, 37)
-    np.testing.assert_array_equal(shown[1, 4], picture[..., 1])
-    assert placement.arrange(picture[..., 0], "YX")[1] == "YX"
+    np.testing.assert_array_equal(shown[1, 4], drawn[..., 1])
+    assert placement.arrange(drawn[..., 0], "YX")[1] == "YX"
 
 
 def test_outlines_follow_every_other_axis():
@@ -160,9 +160,9 @@ def test_outlines_follow_every_other_axis():
 
 
 def test_colour_is_see_through_where_nothing_was_seen(tiny_burst):
-    picture = np.full((2, 2, 3), 51.0, np.float32)
-    picture[0, 0, 1] = np.nan
-    shown = as_colour(picture, tiny_burst.acquisition)
+    drawn = np.full((2, 2, 3), 51.0, np.float32)
+    drawn[0, 0, 1] = np.nan
+    shown = as_colour(image, tiny_burst.acquisition)
     np.testing.assert_allclose(shown[1, 1], [0.2, 0.2, 0.2, 1])
     np.testing.assert_array_equal(shown[0, 0], 0)
     assert limits_of(np.full((3, 3), np.nan, np.float32)) is None

@@ -1,6 +1,6 @@
 """The real window, as a newcomer uses it: File > Open Sample, Plugins > Fiber burst reconstruction, Start.
 
-The pictures in docs/ come from here: `make screenshots`.
+The images in docs/ come from here: `make screenshots`.
 """
 
 import os
@@ -49,6 +49,6 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
             assert imread(path).shape[:2] == (height, width)
 
 
-def dark(picture: np.ndarray) -> float:
-    """Return how much of a picture is nearly black."""
-    return float((picture[..., :3].max(axis=-1) < 40).mean())
+def dark(image: np.ndarray) -> float:
+    """Return how much of an image is nearly black."""
+    return float((image[..., :3].max(axis=-1) < 40).mean())

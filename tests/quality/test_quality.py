@@ -1,4 +1,4 @@
-"""Scores on pictures and motions whose score is known."""
+"""Scores on images and motions whose score is known."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def test_psnr_of_known_noise(rng):
     assert psnr(noisy, truth) == pytest.approx(40, abs=0.1)
 
 
-def test_a_constant_picture_scores_as_the_mean(rng):
+def test_a_constant_image_scores_as_the_mean(rng):
     truth = rng.random((31, 37))
     assert psnr(np.zeros_like(truth), truth) == pytest.approx(-10 * np.log10(truth.var()))
 

@@ -1,4 +1,4 @@
-"""Reconstruction and Canvas: where pictures lie, at any size."""
+"""Reconstruction and Canvas: where images lie, at any size."""
 
 import json
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_a_part_is_drawn_as_in_the_whole(result):
     np.testing.assert_allclose(result.render(bounds=(5, 7, 20, 30)), result.image[7:30, 5:20], atol=0.01)
 
 
-def test_a_finer_drawing_is_the_same_picture(result):
+def test_a_finer_drawing_is_the_same_image(result):
     fine = result.render(scale=3)
     assert fine.shape == (93, 111, 3)
     np.testing.assert_allclose(fine[1::3, 1::3], result.image, atol=0.01)  # the middle of three is the pixel's centre
@@ -158,7 +158,7 @@ def test_homographies_that_say_nothing_are_none_in_json(result):
     assert told["homographies"][0] == np.eye(3).tolist()
 
 
-def test_a_saved_representation_draws_the_same_picture(result, tmp_path):
+def test_a_saved_representation_draws_the_same_image(result, tmp_path):
     path = result.save(tmp_path / "scene.npz")
     again = load(path, device="cpu")
     np.testing.assert_array_equal(again.image, result.image)

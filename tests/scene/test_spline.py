@@ -34,18 +34,18 @@ def everywhere(steps=7):
 
 
 @pytest.mark.parametrize(("period", "overshoot"), [(3.0, 0.5), (4.0, 0.28), (6.0, 0.12)])
-def test_a_picture_does_not_overshoot_as_its_spline_does(period, overshoot):
+def test_an_image_does_not_overshoot_as_its_spline_does(period, overshoot):
     normal, scene = solved(everywhere(), period, 1e-4)
     truth = wave(normal.grid.nodes(), period)
-    spline, picture = (
+    spline, image = (
         float((shown[0] - truth)[INSIDE].abs().max()) / 0.3 for shown in (scene, normal.image(scene, 1e-4))
     )
     assert spline == pytest.approx(overshoot, rel=0.15)
-    assert picture < 0.04
+    assert image < 0.04
 
 
 @pytest.mark.parametrize("radius", [None, 1.3])
-def test_where_the_prior_leads_a_picture_has_what_it_leaves_of_a_wave(radius):
+def test_where_the_prior_leads_an_image_has_what_it_leaves_of_a_wave(radius):
     period, smoothness = 6.0, 40.0
     normal, scene = solved(everywhere(), period, smoothness, radius)
     frequency = torch.tensor([1 / period]), torch.tensor([1 / (2 * period)])
@@ -67,9 +67,9 @@ def test_samples_on_the_nodes_are_left_as_they_are():
     torch.testing.assert_close(scene[0], wave(normal.grid.nodes(), 4.0), atol=1e-3, rtol=0)
 
 
-def test_a_picture_is_as_sharp_between_its_nodes_as_at_them():
+def test_an_image_is_as_sharp_between_its_nodes_as_at_them():
     normal, scene = solved(everywhere(), 4.0, 1e-4)
-    picture = SplineImage(
+    image = SplineImage(
         scene=normal.image(scene, 1e-4),
         grid=normal.grid,
         known=torch.ones(SHAPE, dtype=torch.bool),
@@ -79,10 +79,10 @@ def test_a_picture_is_as_sharp_between_its_nodes_as_at_them():
         black=0.0,
     )
     between = normal.grid.nodes()[INSIDE] + 0.5
-    drawn = picture.render(between.numpy().astype(np.float64), 0)[..., 0]
+    drawn = image.render(between.numpy().astype(np.float64), 0)[..., 0]
     assert np.sqrt(np.mean((drawn - wave(between, 4.0).numpy()) ** 2)) < 0.05 * 0.3
 
 
-def test_a_picture_of_nothing_is_finite():
+def test_an_image_of_nothing_is_finite():
     normal = NormalEquations.empty(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
     assert torch.isfinite(normal.image(normal.solve(0.1, normal.mean()), 0.1)).all()

@@ -25,11 +25,11 @@ SHAPE = (61, 83)
 
 def test_truth_is_the_scene_warped_by_the_homographies():
     simulated = simulate("cat", shape=SHAPE, frames=6, seed=3)
-    picture = skimage.data.cat()[98:243, 163:287].astype(np.float64) / 255  # with room around the field
+    image = skimage.data.cat()[98:243, 163:287].astype(np.float64) / 255  # with room around the field
     top, left = (300 - 61) // 2, (451 - 83) // 2
     for matrix, frame in zip(simulated.homographies, simulated.truth, strict=True):
-        to_picture = ProjectiveTransform(translation_to(left - 163, top - 98) @ matrix)
-        expected = warp(picture, to_picture, output_shape=SHAPE, order=3, mode="reflect")
+        to_image = ProjectiveTransform(translation_to(left - 163, top - 98) @ matrix)
+        expected = warp(image, to_image, output_shape=SHAPE, order=3, mode="reflect")
         assert np.abs(frame - np.clip(expected, 0, 1)).max() < 0.03  # two kinds of cubic
         assert np.abs(frame - expected).mean() < 0.004
 
@@ -47,11 +47,11 @@ def test_frame_0_of_a_photograph_is_the_photograph():
 
 def test_a_large_frame_sees_the_photograph_and_its_reflection():
     scene = make_scene("cat", (400, 500), np.random.default_rng(0))
-    picture = skimage.data.cat() / 255
+    image = skimage.data.cat() / 255
     x0, y0 = -scene.origin[0], -scene.origin[1]  # where the photograph starts in frame 0
     assert (x0, y0) == (25, 50)
     seen = scene.sample(np.array([[x0 + 3, y0 + 4], [x0 - 3, y0 + 4]], dtype=float))
-    np.testing.assert_allclose(seen, [picture[4, 3], picture[4, 3]], atol=1e-4)
+    np.testing.assert_allclose(seen, [image[4, 3], image[4, 3]], atol=1e-4)
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

@@ -23,8 +23,8 @@ _MOST_GAIN_WEIGHT = 1000.0
 _SAME_CORE, _LEAST_SAME = 0.3, 0.7
 
 Pattern = Literal["cores", "unresolved", "none"]
-# One picture or several, or the files that they are in.
-Pictures = ArrayLike | str | Path | Sequence[str | Path]
+# One image or several, or the files that they are in.
+Images = ArrayLike | str | Path | Sequence[str | Path]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -37,7 +37,7 @@ class Bundle(Stored):
     Attributes
     ----------
     pattern : str
-        "cores" where the cores can be told apart; "unresolved" where the picture shows a bundle whose cores are too
+        "cores" where the cores can be told apart; "unresolved" where the image shows a bundle whose cores are too
         close for its pixels; "none" where it shows no bundle. In the last two, square blocks of pixels stand for cores.
     pitch : float
         Distance of neighbouring cores, or the side of the blocks, pixels.
@@ -69,7 +69,7 @@ class Bundle(Stored):
         (H, W) bool, the field: where the bundle is.
     provenance : mapping
         Where the bundle comes from, as plain values: "source" ("burst" or "image"), "frames" (how many), "files" and
-        "dark" (names of the pictures, where they came from files), "date", "version" (of this package), "bursts" (how
+        "dark" (names of the images, where they came from files), "date", "version" (of this package), "bursts" (how
         many it has been improved by), and "frame_from_bundle" in a reconstruction whose frames show the bundle
         elsewhere than where it was calibrated.
 
@@ -157,13 +157,13 @@ class Bundle(Stored):
         if bundle.pattern == "none":
             raise BundleError(
                 f"no bundle is seen in the mean of these {burst.shape[0]} frames; expected a pattern of cores 2.3 to "
-                "24 px apart; calibrate from frames of a moving object, or from a picture in even light"
+                "24 px apart; calibrate from frames of a moving object, or from an image in even light"
             )
         return bundle
 
     @classmethod
-    def from_image(cls, image: "Pictures", *, dark: "Pictures | None" = None, device: str = "auto") -> "Bundle":
-        """Calibrate a bundle from a picture of it with nothing but even light before it.
+    def from_image(cls, image: "Images", *, dark: "Images | None" = None, device: str = "auto") -> "Bundle":
+        """Calibrate a bundle from an image of it with nothing but even light before it.
 
         Parameters
         ----------
@@ -180,7 +180,7 @@ class Bundle(Stored):
         Raises
         ------
         BundleError
-            A picture cannot be read, has another size than the other one, is black or saturated; the dark one is
+            An image cannot be read, has another size than the other one, is black or saturated; the dark one is
             brighter than the other; no bundle is seen.
         """
         from napari_fiberburst.bundle.flat import calibrate_flat  # it makes bundles, so it imports this module
@@ -352,8 +352,8 @@ class Bundle(Stored):
         part = (slice(there.shape[0]), slice(there.shape[1]))
         return replace(placed, transmission=placed.transmission[part], labels=placed.labels[part])
 
-    def picture(self) -> NDArray[np.uint8]:
-        """Return the bundle as a picture, (H, W, 3): transmission in grey, saturated cores red, dead ones blue."""
+    def to_image(self) -> NDArray[np.uint8]:
+        """Return the bundle as an image, (H, W, 3): transmission in grey, saturated cores red, dead ones blue."""
         bright = np.quantile(self.transmission[self.outline], 0.99) if self.outline.any() else 1.0
         grey = np.clip(self.transmission / max(float(bright), 1e-6), 0, 1)
         shown = np.repeat(grey[..., None], 3, axis=2)

@@ -90,9 +90,9 @@ def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, 
 def calibrating_mean(
     mean: Tensor, acquisition: Acquisition, provenance: dict[str, Any], *, even_light: bool = False
 ) -> Generator[str, None, Bundle]:
-    """Calibrate the bundle from one picture of it (H, W) in [0, 1]; yields the name of each step that is done.
+    """Calibrate the bundle from one image of it (H, W) in [0, 1]; yields the name of each step that is done.
 
-    In even light the picture is the transmission; otherwise its slow changes are divided out of it.
+    In even light the image is the transmission; otherwise its slow changes are divided out of it.
     """
     told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": _version()}
     gain_weight = 1.0 if even_light else 0.0
@@ -187,7 +187,7 @@ def remark(bundle: Bundle) -> str:
     return {
         "cores": "",
         "unresolved": "the cores are too close to be told apart; pixels stand for themselves",
-        "none": "no bundle is seen in the frames; they are taken as plain pictures",
+        "none": "no bundle is seen in the frames; they are taken as plain images",
     }[bundle.pattern]
 
 

@@ -1,4 +1,4 @@
-"""Find cores in a picture of even light, and which pixels show which core."""
+"""Find cores in an image of even light, and which pixels show which core."""
 
 import math
 
@@ -28,31 +28,31 @@ _LEAST_BLOB = 0.06
 _LEAST_LIGHT = 0.15
 
 
-def find_cores(picture: Tensor, pitch: float, outline: Tensor) -> NDArray[np.float64]:
+def find_cores(image: Tensor, pitch: float, outline: Tensor) -> NDArray[np.float64]:
     """Return core centres (N, 2) as (x, y), to a fraction of a pixel.
 
     Blobs of the size of a core, moved to the centroid of the light about them.
 
     Parameters
     ----------
-    picture : Tensor
+    image : Tensor
         (H, W), how bright each pixel is in even light, about 1 on average.
     pitch : float
         Distance of neighbouring cores, pixels.
     outline : Tensor
         (H, W) bool, where the bundle is.
     """
-    blob = blur(picture, max(0.4, _INNER * pitch)) - blur(picture, max(0.55, _OUTER * pitch))
-    around = local_mean(picture, 0.7 * pitch)
+    blob = blur(image, max(0.4, _INNER * pitch)) - blur(image, max(0.55, _OUTER * pitch))
+    around = local_mean(image, 0.7 * pitch)
     is_core = (blob == _extreme(blob, round(0.2 * pitch))) & (blob > _LEAST_BLOB * around)
     is_core &= outline & (around > _LEAST_LIGHT)
     peaks = is_core.nonzero().flip(1).cpu().numpy().astype(np.float64)
     if len(peaks) == 0:
         return peaks
-    light = picture.square().cpu().numpy().ravel().astype(np.float64)
+    light = image.square().cpu().numpy().ravel().astype(np.float64)
     labels = nearest_core(peaks, outline.cpu().numpy(), REACH * pitch).ravel()
     own = labels < len(peaks)
-    y, x = (part.ravel()[own] for part in np.indices(picture.shape))
+    y, x = (part.ravel()[own] for part in np.indices(image.shape))
     total, along_x, along_y = (
         np.bincount(labels[own], light[own] * weight, len(peaks)) for weight in (np.ones(len(x)), x, y)
     )
@@ -114,7 +114,7 @@ def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitc
     return float(pitch * math.sqrt(2 * (light * radius**3).sum() / (light * radius).sum()))
 
 
-def _extreme(picture: Tensor, reach: int) -> Tensor:
+def _extreme(image: Tensor, reach: int) -> Tensor:
     """Return the largest value within `reach` pixels, square-wise."""
     reach = max(1, reach)
-    return F.max_pool2d(picture[None], 2 * reach + 1, stride=1, padding=reach)[0]
+    return F.max_pool2d(image[None], 2 * reach + 1, stride=1, padding=reach)[0]

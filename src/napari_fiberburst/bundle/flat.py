@@ -1,4 +1,4 @@
-"""Calibrate a bundle from pictures of it in even light, with or without dark ones."""
+"""Calibrate a bundle from images of it in even light, with or without dark ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,20 +9,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.bundle.bundle import Bundle, Pictures
+from napari_fiberburst.bundle.bundle import Bundle, Images
 from napari_fiberburst.bundle.calibrate import calibrating_mean, in_units, thinned, with_saturated
 from napari_fiberburst.bundle.samples import SATURATED, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import BundleError, BurstError
-from napari_fiberburst.io.folder import read_picture
+from napari_fiberburst.io.folder import read_image
 from napari_fiberburst.steps import drain
 
-# A longer last axis is the width of the picture.
+# A longer last axis is the width of the image.
 _MOST_CHANNELS = 15
 # Part of the full scale that a bright pixel of an even flat reaches at least: below, there is nothing but noise.
 _LEAST_BRIGHT = 0.004
-# The black level is this quantile of a dark picture.
+# The black level is this quantile of a dark image.
 _BLACK_QUANTILE = 0.05
 # Part of the pixels that may be saturated.
 _MOST_SATURATED = 0.2
@@ -30,11 +30,11 @@ _MOST_SATURATED = 0.2
 _LEAST_GAIN, _MOST_GAIN = 0.2, 5.0
 
 
-def calibrate_flat(image: Pictures, dark: Pictures | None, *, device: str = "auto") -> Bundle:
+def calibrate_flat(image: Images, dark: Images | None, *, device: str = "auto") -> Bundle:
     """Calibrate as `Bundle.from_image` does."""
-    name, dark_name = _name(image, "the picture of the bundle in even light"), _name(dark, "the dark picture")
-    flat = _pictures(image, name)
-    black = None if dark is None else _alike(_pictures(dark, dark_name), flat, dark_name, name)
+    name, dark_name = _name(image, "the image of the bundle in even light"), _name(dark, "the dark image")
+    flat = _images(image, name)
+    black = None if dark is None else _alike(_images(dark, dark_name), flat, dark_name, name)
     levels = _in_levels(flat, name)
     place = find_device(device)
     frames = torch.from_numpy(levels.frames).to(place)
@@ -60,7 +60,7 @@ def _found(light: Tensor, acquisition: Acquisition, origin: dict[str, Any], name
 
 
 def _with_dark(bundle: Bundle, darkness: Tensor, acquisition: Acquisition) -> Bundle:
-    """Return the bundle with the black level and the offsets that a dark picture (H, W, C) shows, full scale 1."""
+    """Return the bundle with the black level and the offsets that a dark image (H, W, C) shows, full scale 1."""
     base = float(torch.quantile(thinned(darkness.mean(dim=2)), _BLACK_QUANTILE))
     bundle = replace(bundle, black=in_units(base, acquisition))
     offsets = sample_cores(darkness[None], bundle, acquisition).values[0]
@@ -86,16 +86,16 @@ def _with_channels(bundle: Bundle, frames: Tensor, acquisition: Acquisition) -> 
     )
 
 
-def _pictures(source: Pictures, name: str) -> NDArray[Any]:
-    """Return pictures as (T, H, W, C)."""
+def _images(source: Images, name: str) -> NDArray[Any]:
+    """Return images as (T, H, W, C)."""
     paths = _paths(source)
     if not paths:
         return _stacked(np.asarray(source), name)
     read = [_stacked(_read(path), str(path)) for path in paths]
-    for path, pictures in zip(paths, read, strict=True):
-        if pictures.shape[1:] != read[0].shape[1:]:
+    for path, images in zip(paths, read, strict=True):
+        if images.shape[1:] != read[0].shape[1:]:
             raise BundleError(
-                f"pictures of one bundle must be of one size; {path} has {_size(pictures)} where {paths[0]} has "
+                f"images of one bundle must be of one size; {path} has {_size(images)} where {paths[0]} has "
                 f"{_size(read[0])}; take all with the same camera settings"
             )
     return np.concatenate(read)
@@ -117,13 +117,13 @@ def _stacked(pixels: NDArray[Any], name: str) -> NDArray[Any]:
 
 def _read(path: str | Path) -> NDArray[Any]:
     try:
-        return read_picture(path)
+        return read_image(path)
     except BurstError as error:
         raise BundleError(str(error)) from error
 
 
 def _alike(dark: NDArray[Any], flat: NDArray[Any], dark_name: str, name: str) -> NDArray[Any]:
-    """Return dark pictures with as many channels as the flat; refuse them of another size, or brighter."""
+    """Return dark images with as many channels as the flat; refuse them of another size, or brighter."""
     if flat.shape[1:3] != dark.shape[1:3]:
         raise BundleError(
             f"{dark_name} must have the size of {name}, {flat.shape[1]} x {flat.shape[2]}; got {dark.shape[1]} x "
@@ -166,7 +166,7 @@ def _in_levels(flat: NDArray[Any], name: str) -> Burst:
 
 
 def _paths(source: object) -> list[str | Path]:
-    """Return the paths that pictures are given by; none where they are given as arrays."""
+    """Return the paths that images are given by; none where they are given as arrays."""
     if isinstance(source, str | Path):
         return [source]
     items = list(source) if isinstance(source, list | tuple) else []
@@ -183,6 +183,6 @@ def _name(source: object, otherwise: str) -> str:
     return ", ".join(map(str, _paths(source))) or otherwise
 
 
-def _size(pictures: NDArray[Any]) -> str:
+def _size(images: NDArray[Any]) -> str:
     """Return height and width, and channels where there are several."""
-    return " x ".join(str(side) for side in pictures.shape[1:] if side != 1)
+    return " x ".join(str(side) for side in images.shape[1:] if side != 1)

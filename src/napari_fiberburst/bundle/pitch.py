@@ -12,7 +12,7 @@ from napari_fiberburst.operators.filters import local_mean
 # Pitches looked for, pixels. Below, cores and pixels beat; above, a frame holds too few cores to tell.
 LEAST_PITCH, MOST_PITCH = 2.3, 24.0
 # A bundle is told by two signs together: how far its ring stands out of the spectrum on both sides of it (natural
-# logarithm of power), and how much the picture varies about its own blur. Simulated bundles, jittered, few cores
+# logarithm of power), and how much the image varies about its own blur. Simulated bundles, jittered, few cores
 # across, with bright fibres behind them, have 0.2 to 2.5 and 0.7 to 1.4; plain scenes at most 0.4 in the one and, where
 # they have less than 0 there, 0.6 in the other.
 _USUAL_CONTRAST, _LEAST_CONTRAST = 0.5, 0.1
@@ -21,18 +21,18 @@ _LEAST_SIGN = 0.3
 _PITCH_PER_ROW = 2 / math.sqrt(3)
 
 
-def find_pitch(picture: Tensor) -> float | None:
-    """Return the distance of neighbouring cores in pixels, or None where the picture shows no bundle.
+def find_pitch(image: Tensor) -> float | None:
+    """Return the distance of neighbouring cores in pixels, or None where the image shows no bundle.
 
     The spectrum is averaged over directions, so that a lattice of many grains, which has no direction of its own and
     draws a ring instead of six peaks, is found as well.
 
     Parameters
     ----------
-    picture : Tensor
+    image : Tensor
         (H, W), such as the mean of a burst, in which the object is smeared and the bundle is not.
     """
-    frequency, power = _radial_spectrum(picture)
+    frequency, power = _radial_spectrum(image)
     level = np.log(power + 1e-9 * power.max())
     level = np.convolve(np.pad(level, 2, mode="edge"), np.array([1, 4, 6, 4, 1]) / 16, mode="valid")
     best, peak = -np.inf, None
@@ -49,20 +49,20 @@ def find_pitch(picture: Tensor) -> float | None:
         return None
     near = slice(max(0, peak - 2), peak + 3)
     pitch = float(_PITCH_PER_ROW / np.average(frequency[near], weights=power[near]))
-    envelope = local_mean(picture, 3 * pitch)
+    envelope = local_mean(image, 3 * pitch)
     lit = envelope > 0.1 * envelope.max()
-    contrast = float((picture[lit] / envelope[lit]).std())
+    contrast = float((image[lit] / envelope[lit]).std())
     if contrast < _LEAST_CONTRAST:
         return None
     return pitch if best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
 
 
-def _radial_spectrum(picture: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies, cycles per pixel, and the mean power at each, with the picture's slow changes divided out."""
-    height, width = picture.shape
-    envelope = local_mean(picture, 12.0)
-    flat = picture / (envelope + 1e-3 * picture.max())
-    window = torch.hann_window(height, device=picture.device)[:, None] * torch.hann_window(width, device=picture.device)
+def _radial_spectrum(image: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies, cycles per pixel, and the mean power at each, with the image's slow changes divided out."""
+    height, width = image.shape
+    envelope = local_mean(image, 12.0)
+    flat = image / (envelope + 1e-3 * image.max())
+    window = torch.hann_window(height, device=image.device)[:, None] * torch.hann_window(width, device=image.device)
     flat = (flat - (flat * window).sum() / window.sum()) * window
     power = torch.fft.rfft2(flat).abs().square().cpu()
     frequency = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)[None, :])

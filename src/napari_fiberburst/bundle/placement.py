@@ -1,6 +1,6 @@
 """Find a known bundle in frames: a probe that was plugged in again sits a few pixels away, and a little turned.
 
-The pattern of cores is unique to a bundle, so its picture is searched for, by correlation over shifts at a row of
+The pattern of cores is unique to a bundle, so its image is searched for, by correlation over shifts at a row of
 angles, in the mean of the frames with slow changes divided out. Then every core is looked for where it should be, and
 a rigid motion is fitted to what was found. How many cores are where they should be, and how alike their brightness is,
 tells this bundle from another one, and a change of zoom shows in the scale that the fit would take.
@@ -77,7 +77,7 @@ class Seen:
 
     Attributes
     ----------
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W), the mean of the frames with slow changes divided out.
     lit : numpy.ndarray
         (H, W) bool, where there is light enough to see cores.
@@ -85,7 +85,7 @@ class Seen:
         (N, 2) as (x, y), their centres.
     """
 
-    picture: NDArray[np.float32]
+    image: NDArray[np.float32]
     lit: NDArray[np.bool_]
     cores: NDArray[np.float64]
 
@@ -112,7 +112,7 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     mean = grey[exposed(grey)].mean(dim=0)
     black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
     flat, lit = (part.cpu() for part in _flattened((mean - black).clamp_min(0), bundle.pitch))
-    seen = Seen(picture=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
+    seen = Seen(image=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
     if len(seen.cores) < _LEAST_CORES:
         raise BundleError(
             f"the frames show {len(seen.cores)} cores, too few to tell where the bundle is (expected at least "
@@ -187,22 +187,22 @@ def _is_it(found: tuple[float, float]) -> bool:
     return found[0] >= _LEAST_FOUND and found[1] >= _LEAST_ALIKE
 
 
-def _flattened(picture: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
-    """Return a picture (H, W) divided by itself blurred, 0 where there is no light; and where there is light."""
-    envelope = local_mean(picture, _ENVELOPE * pitch)
+def _flattened(image: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
+    """Return an image (H, W) divided by itself blurred, 0 where there is no light; and where there is light."""
+    envelope = local_mean(image, _ENVELOPE * pitch)
     lit = envelope > _LEAST_LIT * envelope.max()
-    return torch.where(lit, picture / envelope.clamp_min(1e-6), torch.zeros_like(picture)), lit
+    return torch.where(lit, image / envelope.clamp_min(1e-6), torch.zeros_like(image)), lit
 
 
 def _searched(bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
-    """Return the rigid motion, of those searched, at which the pictures correlate best: (3, 3), frame from bundle."""
+    """Return the rigid motion, of those searched, at which the images correlate best: (3, 3), frame from bundle."""
     expected = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     height, width = bundle.shape
     step = np.degrees(_ANGLE_STEP * bundle.pitch / (max(height, width) / 2))
     most = MOST_ROTATION + _MARGIN_ROTATION
     angles = np.arange(-np.ceil(most / step), np.ceil(most / step) + 1) * step
     reach = int(np.ceil(MOST_SHIFT + _MARGIN_SHIFT))
-    spectrum = np.fft.rfft2(seen.picture - seen.picture.mean())
+    spectrum = np.fft.rfft2(seen.image - seen.image.mean())
     best, score = np.eye(3), -np.inf
     for angle in angles:
         motion = _rigid(np.radians(angle), (0.0, 0.0), (width, height))
@@ -276,7 +276,7 @@ def _agreement(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> tuple
         return 0.0, 0.0
     flat = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     known, shown = (
-        map_coordinates(picture, points.T[::-1], order=1) for picture, points in ((flat, here), (seen.picture, there))
+        map_coordinates(image, points.T[::-1], order=1) for image, points in ((flat, here), (seen.image, there))
     )
     near = np.asarray(cKDTree(here).query(here, k=7)[1])
     known, shown = (values - values[near[:, 1:]].mean(axis=1) for values in (known, shown))

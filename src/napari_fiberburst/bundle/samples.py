@@ -2,7 +2,7 @@
 
 In a real bundle there is no detail inside a core: each gathers the light of its footprint and re-emits one value
 through its profile, so one value per core and frame is all there is, and the footprint is part of the model. Where the
-pictures do show detail inside cores (a bundle that merely masks the scene), every lit pixel is a sample of its own.
+images do show detail inside cores (a bundle that merely masks the scene), every lit pixel is a sample of its own.
 """
 
 from collections.abc import Callable

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="fiberburst",
-        description="Turn a burst of frames through a fibre bundle into one clean picture.",
+        description="Turn a burst of frames through a fibre bundle into one clean image.",
     )
     parser.add_argument("--version", action="version", version=f"napari-fiberburst {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")

@@ -12,8 +12,8 @@ from napari_fiberburst.io import read_burst
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
 
-# Endings of files that hold one picture each.
-_PICTURES = (".png", ".npy")
+# Endings of files that hold one image each.
+_IMAGES = (".png", ".npy")
 
 
 def add_to(commands: Any) -> None:
@@ -21,13 +21,13 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "calibrate",
         help="measure a bundle and keep it in a file",
-        description="Measure a bundle: in a burst of a moving object, or in one or several pictures in even light.",
+        description="Measure a bundle: in a burst of a moving object, or in one or several images in even light.",
     )
     parser.add_argument(
         "input",
         type=Path,
         nargs="+",
-        help="a picture of the bundle in even light, which knows the gains best; several with --even; or a burst",
+        help="an image of the bundle in even light, which knows the gains best; several with --even; or a burst",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="a file ending in .bundle")
     parser.add_argument(
@@ -60,15 +60,15 @@ def _calibrated(options: argparse.Namespace) -> "Bundle":
     if others and not options.even:
         raise BundleError(
             f"a burst is one stack, folder or pattern; got {len(options.input)} files; add --even where they are "
-            "pictures of the bundle in even light"
+            "images of the bundle in even light"
         )
-    is_even = options.even or first.suffix.lower() in _PICTURES
+    is_even = options.even or first.suffix.lower() in _IMAGES
     burst = None if is_even else read_burst(first, axes=options.axes)
     if burst is None or burst.shape[0] == 1:
         return Bundle.from_image(options.input, dark=options.dark, device=options.device)
     if options.dark is not None:
         raise BundleError(
-            f"a dark picture belongs to pictures in even light, and {first} is a burst of {burst.shape[0]} frames; add "
+            f"a dark image belongs to images in even light, and {first} is a burst of {burst.shape[0]} frames; add "
             "--even, or leave --dark out"
         )
     bundle = Bundle.from_burst(burst, device=options.device)

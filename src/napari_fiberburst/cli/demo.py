@@ -30,7 +30,7 @@ def add_to(commands: Any) -> None:
         help="simulate a burst, reconstruct it, and compare",
         description="Simulate a burst, reconstruct it, print how close it comes, and draw it.",
     )
-    parser.add_argument("-o", "--output", type=Path, default=Path("demo.png"), help="picture, default demo.png")
+    parser.add_argument("-o", "--output", type=Path, default=Path("demo.png"), help="image, default demo.png")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, mps")
     parser.set_defaults(run=run)
 
@@ -45,19 +45,19 @@ def run(options: argparse.Namespace) -> int:
     result = _fit(simulated.burst, options.device)
     truth = simulated.truth[0]
     captured = simulated.burst.frames[0]
-    pictures = {
+    images = {
         "captured frame": captured,
         "Gaussian filter": _best_gaussian(captured, truth),
         "reconstruction": result.image / np.float32(simulated.burst.white_level),
     }
     print(f"{'':16}  PSNR dB   SSIM   (frame 0, after one gain and offset per channel)")
-    for name, picture in pictures.items():
-        print(f"{name:16}  {psnr(picture, truth):7.2f}  {ssim(picture, truth):5.3f}")
+    for name, image in images.items():
+        print(f"{name:16}  {psnr(image, truth):7.2f}  {ssim(image, truth):5.3f}")
     shape = truth.shape[:2]
     error = motion_error(result.homographies, simulated.homographies, shape)
     still = motion_error(np.broadcast_to(np.eye(3), (len(simulated.truth), 3, 3)), simulated.homographies, shape)
     print(f"motion off by {error:.2f} px on average; unregistered {still:.2f} px")
-    sheet = _side_by_side({**pictures, "truth": truth}, truth)
+    sheet = _side_by_side({**images, "truth": truth}, truth)
     with write_whole(options.output) as stream:
         stream.write(sheet)
     print(f"samples left out are met to {result.held_out_rmse:.2f} of 255; resolution {result.resolution:.1f} px")
@@ -82,25 +82,23 @@ def _fit(burst: Burst, device: str) -> Reconstruction:
 def _best_gaussian(captured: NDArray[np.float32], truth: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the frame filtered by the sigma that comes closest to the truth: the filter at its best."""
     filtered = [gaussian_filter(captured, (sigma, sigma, 0)) for sigma in np.arange(0.5, 4.1, 0.25)]
-    return max(filtered, key=lambda picture: psnr(picture, truth))
+    return max(filtered, key=lambda image: psnr(image, truth))
 
 
-def _side_by_side(pictures: dict[str, NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
-    """Return a PNG of the pictures with their captions, all at the truth's levels but the captured one."""
+def _side_by_side(images: dict[str, NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
+    """Return a PNG of the images with their captions, all at the truth's levels but the captured one."""
     height, width = truth.shape[:2]
-    sheet = Image.new("RGB", (len(pictures) * (width + 8) - 8, height + _CAPTION_HEIGHT), "white")
+    sheet = Image.new("RGB", (len(images) * (width + 8) - 8, height + _CAPTION_HEIGHT), "white")
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=12)
-    for index, (name, picture) in enumerate(pictures.items()):
+    for index, (name, image) in enumerate(images.items()):
         is_raw = name == "captured frame"
-        shown = np.clip(picture if is_raw else match_levels(picture, truth), 0, 1)
+        shown = np.clip(image if is_raw else match_levels(image, truth), 0, 1)
         x = index * (width + 8)
         sheet.paste(Image.fromarray(np.rint(shown * 255).astype(np.uint8)), (x, _CAPTION_HEIGHT))
         draw.text((x + 2, 1), name, fill="black", font=font)
         if name != "truth":
-            draw.text(
-                (x + 2, 16), f"{psnr(picture, truth):.1f} dB / {ssim(picture, truth):.2f}", fill="black", font=font
-            )
+            draw.text((x + 2, 16), f"{psnr(image, truth):.1f} dB / {ssim(image, truth):.2f}", fill="black", font=font)
     encoded = BytesIO()
     sheet.save(encoded, format="PNG")
     return encoded.getvalue()

@@ -24,7 +24,7 @@ def add_to(commands: Any) -> None:
         description="Open a burst, or a bundle that was kept, and say what is known of it.",
     )
     parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, OME-Zarr; or probe.bundle")
-    parser.add_argument("-o", "--output", type=Path, help="draw the bundle as a picture into this file, a .png")
+    parser.add_argument("-o", "--output", type=Path, help="draw the bundle as an image into this file, a .png")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.set_defaults(run=run)
 
@@ -92,7 +92,7 @@ def _of_bundle(path: Path, output: Path | None) -> int:
     describe(bundle)
     if output is not None:
         encoded = BytesIO()
-        Image.fromarray(bundle.picture()).save(encoded, format="PNG")
+        Image.fromarray(bundle.to_image()).save(encoded, format="PNG")
         with write_whole(output) as stream:
             stream.write(encoded.getvalue())
         print(f"wrote {output}")

@@ -29,8 +29,8 @@ def add_to(commands: Any) -> None:
     """Add the command to the parser."""
     parser: argparse.ArgumentParser = commands.add_parser(
         "reconstruct",
-        help="make a picture from a burst",
-        description="Make one clean picture from a burst. Ctrl-C writes what there is; a second one ends at once.",
+        help="make an image from a burst",
+        description="Make one clean image from a burst. Ctrl-C writes what there is; a second one ends at once.",
     )
     parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, or OME-Zarr")
     parser.add_argument(
@@ -38,7 +38,7 @@ def add_to(commands: Any) -> None:
         "--output",
         type=Path,
         required=True,
-        help="picture.ome.tif (its settings go into picture.json beside it), or scene.npz for the fitted networks",
+        help="image.ome.tif (its settings go into image.json beside it), or scene.npz for the fitted networks",
     )
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
@@ -46,9 +46,9 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--bundle",
         type=Path,
-        help="probe.bundle, or a picture of the bundle in even light; with it one frame is a burst",
+        help="probe.bundle, or an image of the bundle in even light; with it one frame is a burst",
     )
-    parser.add_argument("--calibration", type=Path, help="short for --bundle with a picture")
+    parser.add_argument("--calibration", type=Path, help="short for --bundle with an image")
     parser.add_argument(
         "--keep-bundle", type=Path, help="write the bundle here, with what this burst has told of it; a .bundle file"
     )
@@ -58,7 +58,7 @@ def add_to(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Read, fit, write. Returns 130 where the fit was interrupted, though its picture was written."""
+    """Read, fit, write. Returns 130 where the fit was interrupted, though its image was written."""
     check_output(options.output, options.input)
     choices = settings_of(options)
     settings = choose(**choices)
@@ -106,7 +106,7 @@ def _check(options: argparse.Namespace, settings: Settings) -> None:
     """Refuse what cannot be done with bundles, before anything is read."""
     given = [name for name in ("bundle", "calibration", "keep_bundle") if getattr(options, name) is not None]
     if given[:2] == ["bundle", "calibration"]:
-        raise SettingsError("--calibration is short for --bundle with a picture; give one of the two")
+        raise SettingsError("--calibration is short for --bundle with an image; give one of the two")
     if given and isinstance(settings.method, PublishedMethod):
         raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
     if options.keep_bundle is not None:

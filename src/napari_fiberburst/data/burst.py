@@ -37,7 +37,7 @@ class Acquisition:
     times : numpy.ndarray or None
         (T,) seconds at which the frames were taken.
     origin : (int, int)
-        Row and column of the first pixel in the picture that the burst was cropped from.
+        Row and column of the first pixel in the image that the burst was cropped from.
     """
 
     shape: tuple[int, int, int, int]
@@ -162,11 +162,11 @@ class Burst(Acquisition):
         Raises
         ------
         BurstError
-            The crop is empty, leaves the picture, or is under 16 pixels on a side.
+            The crop is empty, leaves the image, or is under 16 pixels on a side.
         """
         for axis, (start, stop), size in zip("yx", (rows, columns), self.shape[1:3], strict=True):
             if not all(isinstance(edge, int | np.integer) for edge in (start, stop)) or not 0 <= start < stop <= size:
-                raise BurstError(f"a crop must lie inside the picture, {axis} within 0:{size}; got {start}:{stop}")
+                raise BurstError(f"a crop must lie inside the image, {axis} within 0:{size}; got {start}:{stop}")
         part = np.ascontiguousarray(self.frames[:, slice(*rows), slice(*columns)])
         _check_size(part.shape)
         _check_contents(part)

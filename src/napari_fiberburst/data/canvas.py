@@ -1,4 +1,4 @@
-"""Canvas: where a picture lies."""
+"""Canvas: where an image lies."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ _MOST_PIXELS = 2**31
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Canvas:
-    """Where a picture lies in frame-0 pixels.
+    """Where an image lies in frame-0 pixels.
 
     Attributes
     ----------
     shape : (int, int)
-        Height and width of the picture.
+        Height and width of the image.
     reference_from_image : numpy.ndarray
-        3x3: picture pixel (x, y) to frame-0 pixel; integers are pixel centres in both.
+        3x3: image pixel (x, y) to frame-0 pixel; integers are pixel centres in both.
     """
 
     shape: tuple[int, int]
@@ -28,14 +28,14 @@ class Canvas:
 
     @classmethod
     def over(cls, bounds: tuple[float, float, float, float], scale: float = 1.0) -> "Canvas":
-        """Cover the frame-0 columns x0 to x1 and rows y0 to y1, `scale` picture pixels to a frame pixel.
+        """Cover the frame-0 columns x0 to x1 and rows y0 to y1, `scale` image pixels to a frame pixel.
 
         Parameters
         ----------
         bounds : (float, float, float, float)
             x0, y0, x1, y1, half-open as in slicing: (0, 0, W, H) is frame 0's field; it may reach beyond.
         scale : float
-            2 doubles the pixels on each axis. Where a side times scale is no whole number, the picture has the
+            2 doubles the pixels on each axis. Where a side times scale is no whole number, the image has the
             nearest whole number of pixels and covers the bounds all the same.
 
         Raises
@@ -54,7 +54,7 @@ class Canvas:
         width, height = (max(1, round((stop - start) * scale)) for start, stop in ((x0, x1), (y0, y1)))
         if width * height > _MOST_PIXELS:
             raise SettingsError(
-                f"a picture of {height} x {width} pixels must be drawn in parts; got bounds {bounds} at scale {scale:g}"
+                f"an image of {height} x {width} pixels must be drawn in parts; got bounds {bounds} at scale {scale:g}"
             )
         step_x, step_y = (x1 - x0) / width, (y1 - y0) / height
         # Pixel edges meet the bounds, so the first centre lies half a step inside them.

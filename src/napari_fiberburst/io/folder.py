@@ -12,7 +12,7 @@ from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.recording import Recording
 from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
 
-PICTURE_ENDINGS = (".png", *TIFF_ENDINGS)
+IMAGE_ENDINGS = (".png", *TIFF_ENDINGS)
 # Where the bit depth stands in the header of every PNG file.
 _PNG_BIT_DEPTH = 24
 
@@ -23,16 +23,16 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part.lower()) for part in parts]
 
 
-def read_pictures(paths: list[Path], source: str) -> Recording:
+def read_images(paths: list[Path], source: str) -> Recording:
     """Read one frame from each file, in natural order of their names.
 
     Raises
     ------
     BurstError
-        No files, a file that is no picture, or pictures of different sizes or types.
+        No files, a file that is no image, or images of different sizes or types.
     """
     if not paths:
-        raise BurstError(f"{source} holds no frames; expected files ending in {', '.join(PICTURE_ENDINGS)}")
+        raise BurstError(f"{source} holds no frames; expected files ending in {', '.join(IMAGE_ENDINGS)}")
     frames: list[NDArray[Any]] = []
     for path in sorted(paths, key=natural_key):
         frame = _read_png(path) if path.suffix.lower() == ".png" else _read_page(path)
@@ -45,18 +45,18 @@ def read_pictures(paths: list[Path], source: str) -> Recording:
     return Recording(pixels=np.stack(frames), axes="TYX" if frames[0].ndim == 2 else "TYXC")
 
 
-def read_picture(path: str | Path) -> NDArray[Any]:
-    """Read one picture, (H, W) or (H, W, C), from a PNG, TIFF or npy file; or the several of a stack, (T, H, W[, C]).
+def read_image(path: str | Path) -> NDArray[Any]:
+    """Read one image, (H, W) or (H, W, C), from a PNG, TIFF or npy file; or the several of a stack, (T, H, W[, C]).
 
     Raises
     ------
     BurstError
-        It is not there, or no picture.
+        It is not there, or no image.
     """
     file = Path(path)
-    endings = (*PICTURE_ENDINGS, ".npy")
+    endings = (*IMAGE_ENDINGS, ".npy")
     if file.suffix.lower() not in endings or not file.is_file():
-        raise BurstError(f"expected the file of a picture, ending in {', '.join(endings)}; got {path}")
+        raise BurstError(f"expected the file of an image, ending in {', '.join(endings)}; got {path}")
     try:
         if file.suffix.lower() == ".npy":
             return np.asarray(np.load(file, allow_pickle=False))
@@ -65,12 +65,12 @@ def read_picture(path: str | Path) -> NDArray[Any]:
     except BurstError:
         raise
     except (OSError, ValueError, EOFError) as error:
-        raise BurstError(f"{path} cannot be read as a picture ({error}); export it again") from error
+        raise BurstError(f"{path} cannot be read as an image ({error}); export it again") from error
     recording = read_tiff(file)
     axes = (recording.axes or "").replace("S", "C")
     order = [axes.index(axis) for axis in "TYXC" if axis in axes]
     if len(order) != len(axes) or not {"Y", "X"} <= set(axes):
-        raise BurstError(f"{path} must hold a picture or a stack of them; got axes {axes}; save it with axes TYXC")
+        raise BurstError(f"{path} must hold an image or a stack of them; got axes {axes}; save it with axes TYXC")
     return np.transpose(recording.pixels, order)
 
 
@@ -88,14 +88,14 @@ def _read_page(path: Path) -> NDArray[Any]:
 
 def _read_png(path: Path) -> NDArray[Any]:
     try:
-        with Image.open(path) as picture:
+        with Image.open(path) as image:
             depth = path.read_bytes()[_PNG_BIT_DEPTH]
-            if depth == 16 and not picture.mode.startswith("I"):
+            if depth == 16 and not image.mode.startswith("I"):
                 raise BurstError(f"{path} has 16 bits per colour, of which only 8 could be read; save it as TIFF")
             # A palette stands for colours, and an alpha channel is no light.
-            mode = {"P": "RGB", "RGBA": "RGB", "LA": "L"}.get(picture.mode, picture.mode)
-            return np.asarray(picture.convert(mode))
+            mode = {"P": "RGB", "RGBA": "RGB", "LA": "L"}.get(image.mode, image.mode)
+            return np.asarray(image.convert(mode))
     except BurstError:
         raise
     except Exception as error:  # Pillow fails on damaged files in many ways
-        raise BurstError(f"{path} cannot be read as a picture ({error}); replace it or leave it out") from error
+        raise BurstError(f"{path} cannot be read as an image ({error}); replace it or leave it out") from error

@@ -8,7 +8,7 @@ import numpy as np
 
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.io.folder import PICTURE_ENDINGS, read_pictures
+from napari_fiberburst.io.folder import IMAGE_ENDINGS, read_images
 from napari_fiberburst.io.recording import Recording
 from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
 from napari_fiberburst.io.zarr import is_zarr, read_zarr
@@ -69,15 +69,15 @@ def read_burst(
 def _open(path: Path) -> Recording:
     if glob.has_magic(str(path)) and not path.exists():
         found = [Path(name) for name in glob.glob(str(path))]
-        return read_pictures(found, str(path))
+        return read_images(found, str(path))
     if not path.exists():
         raise BurstError(f"there is no {path}; expected {_FORMATS}")
     if path.is_dir():
         if is_zarr(path):
             return read_zarr(path)
-        # A dot in front hides a file: those are some system's notes on a picture, not pictures.
-        found = [item for item in path.iterdir() if item.suffix.lower() in PICTURE_ENDINGS and item.name[0] != "."]
-        return read_pictures([item for item in found if item.is_file()], f"the folder {path}")
+        # A dot in front hides a file: those are some system's notes on an image, not images.
+        found = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_ENDINGS and item.name[0] != "."]
+        return read_images([item for item in found if item.is_file()], f"the folder {path}")
     if path.suffix.lower() in TIFF_ENDINGS:
         return read_tiff(path)
     if path.suffix.lower() == ".npz":

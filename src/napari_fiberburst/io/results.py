@@ -1,4 +1,4 @@
-"""Results out: a picture with its provenance beside it, or the fitted networks.
+"""Results out: an image with its provenance beside it, or the fitted networks.
 
 Every file is written whole or not at all.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import OutputError
 
-PICTURE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
+IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 REPRESENTATION_ENDING = ".npz"
 # Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
 _OME_UNITS = ("pm", "Å", "nm", "µm", "mm", "cm", "m", "in", "pixel")
@@ -45,7 +45,7 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
         the source or no result of ours.
     """
     target = Path(path)
-    endings = (*PICTURE_ENDINGS, REPRESENTATION_ENDING)
+    endings = (*IMAGE_ENDINGS, REPRESENTATION_ENDING)
     if not target.name.lower().endswith(endings):
         raise OutputError(f"a result is written to a file ending in {', '.join(endings)}; got {target}")
     files = [target] if is_representation(target) else [target, sidecar_of(target)]
@@ -61,18 +61,18 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
 
 
 def is_representation(path: Path) -> bool:
-    """Whether a path names the fitted networks rather than a picture."""
+    """Whether a path names the fitted networks rather than an image."""
     return path.name.lower().endswith(REPRESENTATION_ENDING)
 
 
 def sidecar_of(path: Path) -> Path:
-    """Return the JSON file beside a picture: picture.ome.tif has picture.json."""
+    """Return the JSON file beside an image: image.ome.tif has image.json."""
     name = path.name
-    ending = next(ending for ending in PICTURE_ENDINGS if name.lower().endswith(ending))
+    ending = next(ending for ending in IMAGE_ENDINGS if name.lower().endswith(ending))
     return path.with_name(name[: -len(ending)] + ".json")
 
 
-def write_picture(
+def write_image(
     path: str | Path, image: NDArray[np.float32], acquisition: Acquisition, provenance: Mapping[str, Any]
 ) -> Path:
     """Write an image as OME-TIFF with pixel size and channel names, and its provenance as JSON beside it."""
@@ -88,8 +88,8 @@ def write_picture(
         if acquisition.channel_names:
             metadata["Channel"] = {"Name": list(acquisition.channel_names)}
     document = json.dumps({**_versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
-    with write_whole(target) as picture, write_whole(sidecar_of(target)) as sidecar:
-        tifffile.imwrite(picture, image, ome=True, photometric="minisblack", metadata=metadata)
+    with write_whole(target) as stream, write_whole(sidecar_of(target)) as sidecar:
+        tifffile.imwrite(stream, image, ome=True, photometric="minisblack", metadata=metadata)
         sidecar.write(document.encode())
     return target
 

@@ -18,7 +18,7 @@ from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 
-# Pictures for the coarse search have at most this many pixels a side.
+# Images for the coarse search have at most this many pixels a side.
 _MOST_SIDE = 128
 # Pairs need this much of the field in common; less is by chance too often alike.
 _LEAST_OVERLAP = 0.12
@@ -26,7 +26,7 @@ _LEAST_OVERLAP = 0.12
 _ALL_PAIRS = 20
 _NEIGHBOURS = 3
 _LANDMARKS = 8
-# Pictures that are this little alike do not show the same thing.
+# Images that are this little alike do not show the same thing.
 LEAST_CONFIDENCE = 0.3
 
 
@@ -66,9 +66,9 @@ def find_shifts(
         Distance of sensors, pixels.
     """
     spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
-    pictures, mask = _pictures(positions, values, weights, shape, spacing, max(0.5, 0.6 * pitch / spacing))
-    correlation = _Correlation(pictures, mask)
-    count = len(pictures)
+    images, mask = _images(positions, values, weights, shape, spacing, max(0.5, 0.6 * pitch / spacing))
+    correlation = _Correlation(images, mask)
+    count = len(images)
     scores = np.zeros((count, count))
     ways = np.zeros((count, count, 2))
     for first, second in _pairs(count):
@@ -110,10 +110,10 @@ def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> float:
     return max(0.0, float((weight * first * second).sum()) / power**0.5) if power > 0 else 0.0
 
 
-def _pictures(
+def _images(
     positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], spacing: float, sigma: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the frames as small pictures (T, h, w), and where there is something to see, (T, h, w)."""
+    """Return the frames as small images (T, h, w), and where there is something to see, (T, h, w)."""
     height, width = shape
     at = Grid.over((0, 0, width - 1, height - 1), spacing).at(positions)
     light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
@@ -131,13 +131,13 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
 
 
 class _Correlation:
-    """Correlation coefficients of pairs of masked pictures, over their overlap, for every shift at once."""
+    """Correlation coefficients of pairs of masked images, over their overlap, for every shift at once."""
 
-    def __init__(self, pictures: Tensor, masks: Tensor) -> None:
-        self._shape = tuple(int(next_fast_len(2 * side, real=True)) for side in pictures.shape[1:])
-        masks = masks.to(pictures.dtype)
+    def __init__(self, images: Tensor, masks: Tensor) -> None:
+        self._shape = tuple(int(next_fast_len(2 * side, real=True)) for side in images.shape[1:])
+        masks = masks.to(images.dtype)
         mass = masks.sum(dim=(1, 2), keepdim=True).clamp_min(1)
-        centred = (pictures - (pictures * masks).sum(dim=(1, 2), keepdim=True) / mass) * masks
+        centred = (images - (images * masks).sum(dim=(1, 2), keepdim=True) / mass) * masks
         self._area = masks.sum(dim=(1, 2))
         self._power = centred.square().sum(dim=(1, 2))
         self._masks, self._values, self._squares = (
@@ -145,7 +145,7 @@ class _Correlation:
         )
 
     def best(self, first: int, second: int) -> tuple[NDArray[np.float64], float]:
-        """Return the shift (x, y) from the second picture to the first, in their pixels, and its score."""
+        """Return the shift (x, y) from the second image to the first, in their pixels, and its score."""
         area = torch.minimum(self._area[first], self._area[second])
         if not float(area) > 0:
             return np.zeros(2), 0.0
@@ -155,7 +155,7 @@ class _Correlation:
         power = self._correlate(self._squares[first], self._masks[second]) - sums**2 / overlap
         power_second = self._correlate(self._masks[first], self._squares[second]) - sums_second**2 / overlap
         joint = self._correlate(self._values[first], self._values[second]) - sums * sums_second / overlap
-        # Flat patches correlate by noise: a share of the whole picture's power steadies the norm.
+        # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
         share = overlap / area
         norm = (power.clamp_min(0) + 0.02 * share * self._power[first]) * (
             power_second.clamp_min(0) + 0.02 * share * self._power[second]

@@ -400,7 +400,7 @@ def _alone(found: Registration, samples: Samples) -> Registration:
     """Return a registration of one frame: that of median brightness, which is neither black nor over-exposed."""
     if len(found.used) > 1:
         found = _noted(
-            found, "the frames could not be registered to one another; the picture is made of one of them alone"
+            found, "the frames could not be registered to one another; the image is made of one of them alone"
         )
     brightness = samples.grey.mean(dim=1).cpu().numpy()
     used = np.arange(len(found.used)) == int(np.argsort(brightness)[len(brightness) // 2])

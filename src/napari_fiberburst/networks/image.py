@@ -42,7 +42,7 @@ class Representation:
     drawn : int
         Samples drawn so far.
     behind : SplineImage, optional
-        The first picture of a calibrated burst: it knows what no core has looked at, how frames lie, and what
+        The first image of a calibrated burst: it knows what no core has looked at, how frames lie, and what
         intensity stands for no light.
     """
 
@@ -68,8 +68,8 @@ class Representation:
             shown: Tensor = self.field(unit, frames)
             return (shown + 1) / 2
 
-        picture = self._by_chunks(intensities, points, frame)
-        return picture if self.behind is None else self.behind.masked(picture + self.behind.black, points, frame)
+        image = self._by_chunks(intensities, points, frame)
+        return image if self.behind is None else self.behind.masked(image + self.behind.black, points, frame)
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
         """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""

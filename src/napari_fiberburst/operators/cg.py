@@ -38,8 +38,8 @@ def conjugate_gradients(
     tolerance : float
         Ends once the residual r has r' M r <= tolerance^2 b' M b.
     inner : callable, optional
-        Inner product. By default over all blocks, which gives a scalar; `inner_of_pictures` solves for several
-        pictures that share one A at once.
+        Inner product. By default over all blocks, which gives a scalar; `inner_of_images` solves for several
+        images that share one A at once.
 
     Returns
     -------
@@ -73,8 +73,8 @@ def inner_of_blocks(first: Blocks, second: Blocks) -> Tensor:
     return total
 
 
-def inner_of_pictures(first: Blocks, second: Blocks) -> Tensor:
-    """Return the inner product of each of C pictures (C, H, W) with its counterpart, (C, 1, 1)."""
+def inner_of_images(first: Blocks, second: Blocks) -> Tensor:
+    """Return the inner product of each of C images (C, H, W) with its counterpart, (C, 1, 1)."""
     (a,), (b,) = first, second
     return (a * b).sum(dim=(-1, -2), keepdim=True)
 

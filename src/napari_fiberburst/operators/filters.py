@@ -1,4 +1,4 @@
-"""Gaussian filters of pictures."""
+"""Gaussian filters of images."""
 
 import math
 
@@ -7,22 +7,22 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 
-def blur(pictures: Tensor, sigma: float) -> Tensor:
-    """Filter pictures (..., H, W) by a Gaussian of `sigma` nodes; outside is 0."""
+def blur(images: Tensor, sigma: float) -> Tensor:
+    """Filter images (..., H, W) by a Gaussian of `sigma` nodes; outside is 0."""
     reach = math.ceil(4 * sigma)
-    shape = [int(next_fast_len(side + reach, real=True)) for side in pictures.shape[-2:]]
+    shape = [int(next_fast_len(side + reach, real=True)) for side in images.shape[-2:]]
     along_y, along_x = (
-        torch.exp(-2 * (math.pi * sigma * frequencies(side, device=pictures.device)) ** 2)
+        torch.exp(-2 * (math.pi * sigma * frequencies(side, device=images.device)) ** 2)
         for side, frequencies in zip(shape, (torch.fft.fftfreq, torch.fft.rfftfreq), strict=True)
     )
-    spectrum = torch.fft.rfft2(pictures, s=shape) * (along_y[:, None] * along_x)
-    filtered: Tensor = torch.fft.irfft2(spectrum, s=shape)[..., : pictures.shape[-2], : pictures.shape[-1]]
+    spectrum = torch.fft.rfft2(images, s=shape) * (along_y[:, None] * along_x)
+    filtered: Tensor = torch.fft.irfft2(spectrum, s=shape)[..., : images.shape[-2], : images.shape[-1]]
     return filtered
 
 
-def local_mean(picture: Tensor, sigma: float, weight: Tensor | None = None) -> Tensor:
+def local_mean(image: Tensor, sigma: float, weight: Tensor | None = None) -> Tensor:
     """Return the Gaussian-weighted mean about each node of (H, W); 0 where nothing has weight."""
-    weight = torch.ones_like(picture) if weight is None else weight
-    total, mass = blur(torch.stack([picture * weight, weight]), sigma)
+    weight = torch.ones_like(image) if weight is None else weight
+    total, mass = blur(torch.stack([image * weight, weight]), sigma)
     mean: Tensor = total / mass.clamp_min(1e-4)
     return mean

@@ -15,7 +15,7 @@ _SUBSAMPLES = 5
 
 
 class Footprint:
-    """Filter pictures on a grid by a disc: each node becomes the mean of the scene about it.
+    """Filter images on a grid by a disc: each node becomes the mean of the scene about it.
 
     Cores are round and the scene's scale hardly differs between frames, so one filter of the scene stands for all
     footprints, and a core is one point in the filtered scene. The filter is symmetric, so it is its own adjoint.
@@ -23,11 +23,11 @@ class Footprint:
     Parameters
     ----------
     grid : Grid
-        Where the pictures live; outside, they are 0.
+        Where the images live; outside, they are 0.
     radius : float
         Of the disc, pixels.
     device : torch.device
-        Where the pictures are.
+        Where the images are.
     """
 
     def __init__(self, grid: Grid, radius: float, device: torch.device) -> None:
@@ -48,15 +48,15 @@ class Footprint:
         """Return a footprint, the same one for the same arguments: its response is worth keeping."""
         return Footprint(grid, radius, device)
 
-    def __call__(self, pictures: Tensor) -> Tensor:
-        """Return the filtered pictures, (..., H, W)."""
-        spectrum = torch.fft.rfft2(pictures, s=self._padded) * self._response
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the filtered images, (..., H, W)."""
+        spectrum = torch.fft.rfft2(images, s=self._padded) * self._response
         filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
         return filtered
 
-    def adjoint(self, pictures: Tensor) -> Tensor:
-        """Return the filtered pictures."""
-        return self(pictures)
+    def adjoint(self, images: Tensor) -> Tensor:
+        """Return the filtered images."""
+        return self(images)
 
     def transfer(self, along_y: Tensor, along_x: Tensor) -> Tensor:
         """Return the filter's response at frequencies (Fy,) by (Fx,), cycles per node: (Fy, Fx)."""

@@ -1,4 +1,4 @@
-"""A picture as a linear spline: values on a regular grid of nodes, bilinear between them."""
+"""An image as a linear spline: values on a regular grid of nodes, bilinear between them."""
 
 import math
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from torch import Tensor
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.operators.stencil import Stencil
 
-# Grids beyond this are a sign of a motion gone wrong, not of a picture.
+# Grids beyond this are a sign of a motion gone wrong, not of an image.
 _MOST_NODES = 2**27
 
 
@@ -59,12 +59,12 @@ class Grid:
         return torch.stack([x, y], dim=-1)
 
     def at(self, points: Tensor) -> "Sampling":
-        """Return the operator that samples pictures at points (..., 2)."""
+        """Return the operator that samples images at points (..., 2)."""
         return Sampling(self, points)
 
 
 class Sampling:
-    """Bilinear interpolation at fixed points: calling it samples a picture, its adjoint splats values onto the nodes.
+    """Bilinear interpolation at fixed points: calling it samples an image, its adjoint splats values onto the nodes.
 
     Parameters
     ----------
@@ -95,22 +95,22 @@ class Sampling:
         corners = torch.stack([left * above, self._x * above, left * self._y, self._x * self._y], dim=-1)
         self._weight = corners * self.inside.unsqueeze(-1)
 
-    def __call__(self, picture: Tensor) -> Tensor:
-        """Return a picture (H, W) at the points, (...)."""
-        values: Tensor = (picture.reshape(-1)[self._index] * self._weight).sum(dim=-1)
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return an image (H, W) at the points, (...)."""
+        values: Tensor = (image.reshape(-1)[self._index] * self._weight).sum(dim=-1)
         return values
 
     def adjoint(self, values: Tensor) -> Tensor:
         """Return what values (...) at the points add to the nodes, (H, W)."""
         return self._add(values.unsqueeze(-1) * self._weight, self._index)
 
-    def of_channels(self, pictures: Tensor) -> Tensor:
-        """Return pictures (C, H, W) at the points, (..., C)."""
-        return torch.stack([self(picture) for picture in pictures], dim=-1)
+    def of_channels(self, images: Tensor) -> Tensor:
+        """Return images (C, H, W) at the points, (..., C)."""
+        return torch.stack([self(image) for image in images], dim=-1)
 
-    def gradient(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the picture's slope per pixel along x and along y at the points; 0 outside."""
-        a, b, c, d = picture.reshape(-1)[self._index].unbind(dim=-1)
+    def gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the image's slope per pixel along x and along y at the points; 0 outside."""
+        a, b, c, d = image.reshape(-1)[self._index].unbind(dim=-1)
         scale = self.inside / self.grid.spacing
         along_x = ((1 - self._y) * (b - a) + self._y * (d - c)) * scale
         along_y = ((1 - self._x) * (c - a) + self._x * (d - b)) * scale

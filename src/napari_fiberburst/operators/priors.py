@@ -1,4 +1,4 @@
-"""Priors on how smooth a picture is, as the matrices of their energies."""
+"""Priors on how smooth an image is, as the matrices of their energies."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from torch import Tensor
 
 @dataclass(frozen=True, slots=True)
 class SmoothnessPrior:
-    """The matrix P of an energy x' P x / 2 of pictures, which is its own adjoint.
+    """The matrix P of an energy x' P x / 2 of images, which is its own adjoint.
 
     Attributes
     ----------
@@ -21,15 +21,15 @@ class SmoothnessPrior:
 
     order: Literal[1, 2]
 
-    def __call__(self, pictures: Tensor) -> Tensor:
-        """Return P x for pictures (..., H, W)."""
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return P x for images (..., H, W)."""
         for _ in range(self.order):
-            pictures = _slopes_squared(pictures)
-        return pictures
+            images = _slopes_squared(images)
+        return images
 
-    def adjoint(self, pictures: Tensor) -> Tensor:
+    def adjoint(self, images: Tensor) -> Tensor:
         """Return P x."""
-        return self(pictures)
+        return self(images)
 
     @property
     def diagonal(self) -> float:

@@ -23,11 +23,11 @@ class Stencil:
 
     @property
     def row_sums(self) -> Tensor:
-        """The sum of each row, (H, W): what the matrix does to an even picture of ones."""
+        """The sum of each row, (H, W): what the matrix does to an even image of ones."""
         return self(torch.ones_like(self.diagonal))
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Return the product with pictures (..., H, W)."""
+        """Return the product with images (..., H, W)."""
         diagonal, right, below, below_right, below_left = self.bands
         y: Tensor = diagonal * x
         coupling = right[:, :-1]
@@ -45,5 +45,5 @@ class Stencil:
         return y
 
     def adjoint(self, x: Tensor) -> Tensor:
-        """Return the product with pictures (..., H, W)."""
+        """Return the product with images (..., H, W)."""
         return self(x)

@@ -40,7 +40,7 @@ def diagnose(
     notes: tuple[str, ...] = (),
     is_scene_shown: bool = True,
 ) -> Diagnostics:
-    """Return what is known of a reconstruction beside its picture.
+    """Return what is known of a reconstruction beside its image.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def diagnose(
     notes : tuple of str
         What is known to be wrong already.
     is_scene_shown : bool
-        Whether the picture shows this scene; where a network shows it instead, what holds for the scene alone
+        Whether the image shows this scene; where a network shows it instead, what holds for the scene alone
         (uncertainty, residuals, held-out error) is left open.
     """
     samples = scene.samples

@@ -141,7 +141,7 @@ class Training:
     control, initial
         As in `napari_fiberburst.iterate`.
     fitted : Fitted, optional
-        The burst, calibrated and registered, with a first picture; without, it is fitted as published.
+        The burst, calibrated and registered, with a first image; without, it is fitted as published.
     """
 
     def __init__(

@@ -48,7 +48,7 @@ def reconstruct(
     initial: Reconstruction | None = None,
     **more: Any,
 ) -> Reconstruction:
-    """Turn a burst into one clean picture.
+    """Turn a burst into one clean image.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def reconstruct(
     seed : int
         The same seed gives the same bits on the same CPU with the same number of threads.
     bundle : Bundle, array_like or path, optional
-        The bundle, where it is known: a `Bundle`, a file that one was saved to, or a picture of the bundle with nothing
+        The bundle, where it is known: a `Bundle`, a file that one was saved to, or an image of the bundle with nothing
         but even light before it. It is never needed, but where it is given, one frame is a burst. It may sit up to 5
         pixels or 2 degrees away from where it was measured; `Reconstruction.notes` then says by how much.
     calibration : array_like or path, optional
@@ -165,7 +165,7 @@ def as_burst(frames: Burst | ArrayLike | str | Path) -> Burst:
 
 
 def as_bundle(bundle: Bundle | ArrayLike | str | Path) -> Bundle:
-    """Return a bundle for whatever `reconstruct` takes: a bundle, its file, or a picture of it in even light."""
+    """Return a bundle for whatever `reconstruct` takes: a bundle, its file, or an image of it in even light."""
     if isinstance(bundle, Bundle):
         return bundle
     if isinstance(bundle, str | Path) and Bundle.is_file(bundle):

@@ -66,7 +66,7 @@ class SplineFit:
         return self._snapshot(None, is_last=True), ending
 
     def round_off(self) -> Fitted:
-        """Make what is known belong together, with a first picture of it."""
+        """Make what is known belong together, with a first image of it."""
         self._fitted = self._stages.round_off(self._fitted)
         return self._fitted
 
@@ -107,7 +107,7 @@ class SplineFit:
             yield None if self._fitted is None else self._snapshot(before)
 
     def _snapshot(self, before: Fitted | None, *, is_last: bool = False) -> Snapshot:
-        """Return a snapshot, with the picture where it is another one than before."""
+        """Return a snapshot, with the image where it is another one than before."""
         fitted = self.fitted
         image = fitted.image
         is_new = image is not None and (before is None or before.image is not image)

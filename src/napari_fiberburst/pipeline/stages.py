@@ -50,13 +50,13 @@ class Fitted:
     registration : Registration
         Of the frames.
     canvas : Canvas
-        Where the picture lies.
+        Where the image lies.
     samples : Samples or None
         The final samples, in all channels, as they were taken; None until it is known what a sample is.
     scene : Scene or None
         The latest solution.
     image : SplineImage or None
-        The latest picture; it knows by itself how the frames lay when it was made.
+        The latest image; it knows by itself how the frames lay when it was made.
     notes : tuple of str
         What a user should know, beside the notes of the registration.
     """
@@ -71,7 +71,7 @@ class Fitted:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """All that a user should know before trusting the picture."""
+        """All that a user should know before trusting the image."""
         return (*self.notes, *self.registration.notes)
 
 
@@ -140,7 +140,7 @@ class Stages:
                 return self._with_scene(fitted, end.value)
 
     def round_off(self, fitted: Fitted | None) -> Fitted:
-        """Make bundle, samples, motion and picture belong together, wherever the steps have ended."""
+        """Make bundle, samples, motion and image belong together, wherever the steps have ended."""
         if fitted is None:
             bundle = plain_frames(self._burst.shape[1:3], self._burst)
             samples = sample_cores(self._grey[..., None], bundle, self._burst)
@@ -176,7 +176,7 @@ class Stages:
         return bundle, (_warned(text),) if text else ()
 
     def _register(self, fitted: Fitted, samples: Samples) -> Generator[Fitted, None, Fitted]:
-        """Find the motion by whole cores, with a picture on the way and at the end."""
+        """Find the motion by whole cores, with an image on the way and at the end."""
         steps = registering(
             samples,
             dof=self._method.motion.dof,
@@ -244,7 +244,7 @@ class Stages:
         return sample_cores(self._frames, fitted.bundle, self._burst) if fitted.samples is None else fitted.samples
 
     def _sketched(self, fitted: Fitted) -> Fitted:
-        """Solve a coarse picture of all that is known so far."""
+        """Solve a coarse image of all that is known so far."""
         samples = self._in_colour(fitted)
         fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
         spacing = max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
@@ -252,7 +252,7 @@ class Stages:
         return self._with_scene(fitted, scene)
 
     def _with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
-        """Return what is known with another scene, and the picture that it stands for."""
+        """Return what is known with another scene, and the image that it stands for."""
         if fitted.scene is not None and scene.coefficients is fitted.scene.coefficients:
             return replace(fitted, scene=scene)
         image = image_of(scene, fitted.registration, fitted.bundle, self._burst, fill=self._method.fill)

@@ -16,7 +16,7 @@ from napari_fiberburst.settings import Settings
 
 # Reports make the host wait for the device, so there are few of them, and more would not be seen.
 _SECONDS_BETWEEN_REPORTS = 0.1
-# Drawing a picture asks a network for every pixel: watching takes at most this part of the time of a fit.
+# Drawing an image asks a network for every pixel: watching takes at most this part of the time of a fit.
 _PREVIEWS_SHARE = 0.05
 
 Draw = Callable[[], NDArray[np.float32]]
@@ -37,11 +37,11 @@ class Snapshot:
     settings : Settings
         What the method goes on with.
     canvas : Canvas
-        Where the picture lies.
+        Where the image lies.
     draw : callable or None
-        Draws the picture as of now; None where there is none yet, or no new one.
+        Draws the image as of now; None where there is none yet, or no new one.
     is_milestone : bool
-        Whether the picture is new because a stage has ended, and therefore always shown; the picture of a network
+        Whether the image is new because a stage has ended, and therefore always shown; the image of a network
         changes with every step, and is shown from time to time.
     held_out_rmse : float or None
         As in `Progress`.
@@ -173,20 +173,20 @@ def _progress(
 
 
 class _Previews:
-    """When pictures are drawn."""
+    """When images are drawn."""
 
     def __init__(self, every: float | None) -> None:
         self._every = every
         self._drawn = self._cost = 0.0
 
     def taken(self, snapshot: Snapshot, clock: Clock) -> NDArray[np.float32] | None:
-        """Return the picture where one is wanted now."""
+        """Return the image where one is wanted now."""
         if self._every is None or snapshot.draw is None:
             return None
         before = clock.seconds
         if not snapshot.is_milestone and before - self._drawn < max(self._every, self._cost / _PREVIEWS_SHARE):
             return None
-        picture = snapshot.draw()
+        image = snapshot.draw()
         self._drawn = clock.seconds
         self._cost = self._drawn - before
-        return picture
+        return image

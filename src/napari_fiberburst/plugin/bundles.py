@@ -1,4 +1,4 @@
-"""From napari's layers to a bundle: one that was opened from a file, or a picture of it in even light."""
+"""From napari's layers to a bundle: one that was opened from a file, or an image of it in even light."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ class BundleSource:
     name : str
         The layer.
     image : array
-        Its data: the transmission of a bundle that is known, or else a picture of the bundle in even light.
+        Its data: the transmission of a bundle that is known, or else an image of the bundle in even light.
     bundle : Bundle or None
         The bundle, where it is known.
     words : str
@@ -63,7 +63,7 @@ def may_be_burst(layer: Layer) -> bool:
 
 
 def may_be_bundle(layer: Layer) -> bool:
-    """Whether a layer holds a bundle that was opened, or could be a picture of one in even light."""
+    """Whether a layer holds a bundle that was opened, or could be an image of one in even light."""
     if _holds_bundle(layer):
         return True
     return may_be_burst(layer) and not layer.multiscale and layer.data.ndim <= _MOST_AXES

@@ -25,13 +25,13 @@ class Truth:
 
     Attributes
     ----------
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W, C) float32 in [0, 1], frame 0 without bundle and noise.
     homographies : numpy.ndarray
         (T, 3, 3), frame-t pixel to frame-0 pixel.
     """
 
-    picture: NDArray[np.float32]
+    image: NDArray[np.float32]
     homographies: NDArray[np.float64]
 
 
@@ -210,7 +210,7 @@ def region_of(shapes: Shapes, burst: Image, axes: str) -> Region:
 
 
 def data_of(layer: Image) -> Any:
-    """Return a layer's array at full resolution, without the alpha channel of an RGBA picture."""
+    """Return a layer's array at full resolution, without the alpha channel of an RGBA image."""
     data = layer.data[0] if layer.multiscale else layer.data
     return data[..., :3] if layer.rgb and data.shape[-1] == 4 else data
 
@@ -240,7 +240,7 @@ def _truth(metadata: dict[str, Any], data: Any, axes: str) -> Truth | None:
         or (data.ndim == 3) != (channels == 1)
     ):
         return None
-    return Truth(picture=metadata["truth"][0], homographies=metadata["homographies"])
+    return Truth(image=metadata["truth"][0], homographies=metadata["homographies"])
 
 
 def _path(layer: Image, metadata: dict[str, Any]) -> str | None:

@@ -20,7 +20,7 @@ def as_python(
     choices : mapping
         What `napari_fiberburst.reconstruct` takes by name.
     bundle : BundleSource, optional
-        The bundle; one that was not opened from a file is a picture, and taken from the viewer.
+        The bundle; one that was not opened from a file is an image, and taken from the viewer.
     before : str
         The lines that made the result which this run continues.
     """
@@ -34,7 +34,7 @@ def as_python(
     imports = "reconstruct" if plain else "Burst, reconstruct"
     body = "\n".join(f"    {line}," for line in lines)
     call = f"result = reconstruct(\n{body}\n)\n"
-    return f'{before}from napari_fiberburst import {imports}\n\n{call}result.save("picture.ome.tif")\n'
+    return f'{before}from napari_fiberburst import {imports}\n\n{call}result.save("image.ome.tif")\n'
 
 
 def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSource | None = None) -> str:
@@ -51,7 +51,7 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSo
     elif path is None:
         path = "burst.tif"
         lines.append(f"# save layer {source.name!r} as {path} first")
-    words = ["fiberburst", "reconstruct", path, "-o", "picture.ome.tif"]
+    words = ["fiberburst", "reconstruct", path, "-o", "image.ome.tif"]
     if not _file_tells_axes(source):
         words += ["--axes", source.axes if len(source.names) == 1 else f"C{source.axes}"]
     if source.region is not None:

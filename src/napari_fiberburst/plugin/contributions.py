@@ -20,7 +20,7 @@ LayerData = tuple[Any, dict[str, Any], str]
 _PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
-# RGBA of a bundle's cores by their state, as `Bundle.picture` has them, and the quantile of light that is shown white.
+# RGBA of a bundle's cores by their state, as `Bundle.image` has them, and the quantile of light that is shown white.
 _CORE_COLOURS = {"core": (0.5, 0.8, 0.4, 1.0), "saturated": (1.0, 0.3, 0.3, 1.0), "dead": (0.2, 0.4, 1.0, 1.0)}
 _BRIGHTEST = 0.99
 
@@ -134,7 +134,7 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
 
 
 def write(path: str, data: Any, attributes: dict[str, Any]) -> list[str]:
-    """Write the picture of a run as OME-TIFF, with its settings and what it rests on as JSON beside it.
+    """Write the image of a run as OME-TIFF, with its settings and what it rests on as JSON beside it.
 
     Other image layers become plain OME-TIFF: napari gives this writer every layer that is saved as ``.ome.tif``.
 
@@ -158,7 +158,7 @@ def write(path: str, data: Any, attributes: dict[str, Any]) -> list[str]:
 
 def reconstruct_layer() -> None:
     """Open the dock and reconstruct the layer that is selected."""
-    _start("picture")
+    _start("image")
 
 
 def register_layer() -> None:
@@ -186,9 +186,9 @@ def _start(show: str) -> None:
 
 
 def _holds_frames(folder: Path) -> bool:
-    from napari_fiberburst.io.folder import PICTURE_ENDINGS
+    from napari_fiberburst.io.folder import IMAGE_ENDINGS
 
-    return any(item.suffix.lower() in PICTURE_ENDINGS for item in folder.iterdir())
+    return any(item.suffix.lower() in IMAGE_ENDINGS for item in folder.iterdir())
 
 
 def _as_recorded(burst: "Burst") -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a run shows while it goes and when it is done: its state in words, its picture, its curves, its past."""
+"""What a run shows while it goes and when it is done: its state in words, its image, its curves, its past."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -67,10 +67,10 @@ class Display(QObject):
         self.status.setText("starting")
 
     def preview(self, run: KeptRun, job: Job, report: "Progress") -> None:
-        """Show the picture that a running fit has come to, and keep it."""
+        """Show the image that a running fit has come to, and keep it."""
         if report.preview is not None and job.acquisition is not None:
             run.history.add(HistoryEntry(report.seconds, report.preview, report.canvas))
-            run.layers.show_picture(report.preview, job.acquisition, report.canvas)
+            run.layers.show_image(report.preview, job.acquisition, report.canvas)
             if run is self._selected:
                 self.select(run)
 
@@ -107,11 +107,11 @@ class Display(QObject):
         self.status.setText("The run failed. Change the settings or the burst, and press Start.")
 
     def select(self, run: KeptRun | None) -> None:
-        """Let the history be that of a run, at its newest picture; one that was gone back through shows it again."""
+        """Let the history be that of a run, at its newest image; one that was gone back through shows it again."""
         before = self._selected
         if before is not None and before.result is not None and self.slider.value() < self.slider.maximum():
             result = before.result
-            before.layers.show_picture(result.image, result.acquisition, result.canvas)
+            before.layers.show_image(result.image, result.acquisition, result.canvas)
         self._selected = run
         self.slider.blockSignals(True)
         self.slider.setMaximum(0 if run is None else max(0, len(run.history.entries) - 1))
@@ -132,7 +132,7 @@ class Display(QObject):
         self.bar.setVisible(False)
         self.slider.setOrientation(Qt.Orientation.Horizontal)
         self.slider.setMaximum(0)
-        self.slider.setToolTip("Goes back through the pictures of the run that is selected.")
+        self.slider.setToolTip("Goes back through the images of the run that is selected.")
         state, past = QWidget(), QWidget()
         column, row = QVBoxLayout(state), QHBoxLayout(past)
         for layout in (column, row):
@@ -158,11 +158,11 @@ class Display(QObject):
             self._curves.show_points(job.curve, span)
 
     def _scrub(self, index: int) -> None:
-        """Show a picture of the past."""
+        """Show an image of the past."""
         run = self._selected
         if run is not None and run.result is not None and index < len(run.history.entries):
             entry = run.history.entries[index]
-            run.layers.show_picture(entry.picture, run.result.acquisition, entry.canvas)
+            run.layers.show_image(entry.image, run.result.acquisition, entry.canvas)
 
 
 class AnimationThrottle:

@@ -60,7 +60,7 @@ class FiberBurstWidget(QWidget):
         super().__init__(parent)
         self._viewer = viewer
         self._was_docked = False
-        self._shown_at_end = "picture"
+        self._shown_at_end = "image"
         self._run: KeptRun | None = None
         self._missing: dict[str, str] | None = None
         self._throttle = AnimationThrottle()
@@ -103,8 +103,8 @@ class FiberBurstWidget(QWidget):
             choices = {"iterations": steps}
             self._begin(run.source, choices, run.layers.placement, bundle=run.bundle, after=run)
 
-    def start_on(self, layer: "Layer", show: str = "picture") -> None:
-        """Reconstruct a layer with the form as it is, and show the picture or the stabilised burst in the end."""
+    def start_on(self, layer: "Layer", show: str = "image") -> None:
+        """Reconstruct a layer with the form as it is, and show the image or the stabilised burst in the end."""
         if self.runner.state != "ready":
             show_error("a run is going; stop it, or wait for its end, before the next one")
         elif layer not in self.input.burst.choices:
@@ -123,7 +123,7 @@ class FiberBurstWidget(QWidget):
         self.input.reset_choices()
 
     def sizeHint(self) -> QSize:
-        """Ask for a narrow dock: the picture is what matters."""
+        """Ask for a narrow dock: the image is what matters."""
         return QSize(_WIDTH, super().sizeHint().height())
 
     def event(self, event: QEvent | None) -> bool:
@@ -162,7 +162,7 @@ class FiberBurstWidget(QWidget):
             initial=initial,
         )
         self._run = KeptRun(name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle)
-        self._shown_at_end = "picture"
+        self._shown_at_end = "image"
         self.display.begin()
         self.runs.add(self._run)
         self.runner.start(job, f"{name} of {source.name}")
@@ -187,10 +187,10 @@ class FiberBurstWidget(QWidget):
             self.runs.refresh()
 
     def _show_what_was_asked(self, run: KeptRun) -> None:
-        """Hide the picture where something else of a result was asked for, now that all is there."""
-        if run is self._run and self._shown_at_end != "picture":
+        """Hide the image where something else of a result was asked for, now that all is there."""
+        if run is self._run and self._shown_at_end != "image":
             run.layers.set_visible(self._shown_at_end, True)
-            run.layers.set_visible("picture", False)
+            run.layers.set_visible("image", False)
 
     def _fail(self, problem: str) -> None:
         """Say why a run came to nothing."""

@@ -1,4 +1,4 @@
-"""The pictures that a run has shown, to go back through."""
+"""The images that a run has shown, to go back through."""
 
 from dataclasses import dataclass
 
@@ -12,30 +12,30 @@ _MOST_BYTES = 128 * 2**20
 
 @dataclass(frozen=True, eq=False)
 class HistoryEntry:
-    """The picture of a run at one time.
+    """The image of a run at one time.
 
     Attributes
     ----------
     seconds : float
         Since the run's first step.
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W) or (H, W, C) float32 in intensity units.
     canvas : Canvas
         Where it lies.
     """
 
     seconds: float
-    picture: NDArray[np.float32]
+    image: NDArray[np.float32]
     canvas: Canvas
 
 
 class History:
-    """Keeps the first picture, the newest, and as many between as memory allows, evenly.
+    """Keeps the first image, the newest, and as many between as memory allows, evenly.
 
     Parameters
     ----------
     most_bytes : int
-        Of all pictures together.
+        Of all images together.
     """
 
     def __init__(self, most_bytes: int = _MOST_BYTES) -> None:
@@ -45,16 +45,16 @@ class History:
 
     @property
     def entries(self) -> list[HistoryEntry]:
-        """The pictures kept, oldest first."""
+        """The images kept, oldest first."""
         return [entry for _, entry in self._kept]
 
     def add(self, entry: HistoryEntry) -> None:
-        """Keep a picture; where memory is full, every second one is let go, now and from now on."""
+        """Keep an image; where memory is full, every second one is let go, now and from now on."""
         if self._kept and self._kept[-1][0] % self._every:
             self._kept.pop()  # it was there as the newest alone
         self._kept.append((self._offered, entry))
         self._offered += 1
-        while len(self._kept) > 2 and sum(kept.picture.nbytes for _, kept in self._kept) > self._most:
+        while len(self._kept) > 2 and sum(kept.image.nbytes for _, kept in self._kept) > self._most:
             self._every *= 2
             *older, newest = self._kept
             self._kept = [*(item for item in older if item[0] % self._every == 0), newest]

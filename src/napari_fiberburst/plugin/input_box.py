@@ -138,7 +138,7 @@ class InputBox(QWidget):
             "One frame, without T, is a burst where its bundle is chosen."
         )
         self.bundle.tooltip = (
-            "A bundle that was opened, or a picture of the bundle with nothing but even light before it. Never needed, "
+            "A bundle that was opened, or an image of the bundle with nothing but even light before it. Never needed, "
             "but with it one frame is a burst."
         )
         self.open_button.setToolTip("Open a bundle that was kept: a .bundle file.")

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Comparing a picture with the truth takes as long as some steps do, and must not slow the run down.
+# Comparing an image with the truth takes as long as some steps do, and must not slow the run down.
 _SCORING_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scores:
-    """How close a picture and a motion are to a simulated burst's truth.
+    """How close an image and a motion are to a simulated burst's truth.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Job:
     choices : mapping
         What `napari_fiberburst.reconstruct` takes by name.
     bundle : Bundle or array, optional
-        The bundle, or a picture of it in even light.
+        The bundle, or an image of it in even light.
     initial : Reconstruction, optional
         To continue from.
 
@@ -170,31 +170,31 @@ class Job:
             self.previews.put(report)
 
     def _score(self, report: "Progress") -> Scores | None:
-        """Compare with the truth where there is one and a picture, now and then."""
+        """Compare with the truth where there is one and an image, now and then."""
         began = time.perf_counter()
         is_soon = began - self._scored < self._scoring / _SCORING_SHARE and report.remaining != 0
         is_frame = report.settings.flat().get("canvas", "frame") == "frame"
         if self._truth is None or report.preview is None or not is_frame or is_soon:
             return None
         if not np.allclose(report.homographies[0], np.eye(3), atol=1e-6):
-            return None  # the picture is over another frame, for frame 0 is of no use
+            return None  # the image is over another frame, for frame 0 is of no use
         scores = score(report.preview, report.homographies, self._truth)
         self._scored = time.perf_counter()
         self._scoring = self._scored - began
         return scores
 
 
-def score(picture: NDArray[np.float32], homographies: NDArray[np.float64], truth: Truth) -> Scores:
-    """Compare a picture of frame 0's field, at any scale, and a motion with the truth."""
+def score(image: NDArray[np.float32], homographies: NDArray[np.float64], truth: Truth) -> Scores:
+    """Compare an image of frame 0's field, at any scale, and a motion with the truth."""
     from skimage.transform import resize
 
     from napari_fiberburst.quality import motion_error, psnr, ssim
 
-    shown = picture if picture.ndim == 3 else picture[..., None]
+    shown = image if image.ndim == 3 else image[..., None]
     known = np.isfinite(shown)
     # Pixels that no core has seen take the mean, because there is nothing to compare.
     shown = np.where(known, shown, shown.mean(axis=(0, 1), where=known))
-    wanted = truth.picture
+    wanted = truth.image
     if shown.shape != wanted.shape:
         shown = resize(shown, wanted.shape, anti_aliasing=True, preserve_range=True)
     return Scores(
@@ -212,7 +212,7 @@ def _cropped(source: BurstSource) -> Truth | None:
     (y0, y1), (x0, x1) = source.region
     inside = np.array([[1, 0, x0], [0, 1, y0], [0, 0, 1]], dtype=np.float64)
     return Truth(
-        picture=truth.picture[y0:y1, x0:x1],
+        image=truth.image[y0:y1, x0:x1],
         homographies=np.linalg.inv(inside) @ truth.homographies @ inside,
     )
 

@@ -1,4 +1,4 @@
-"""The layers of one run: the picture while it resolves, how the frames lie on it, and what it rests on."""
+"""The layers of one run: the image while it resolves, how the frames lie on it, and what it rests on."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -56,22 +56,22 @@ class RunLayers:
         self._outlined = self._outlining = 0.0
 
     @property
-    def pictures(self) -> list[Layer]:
-        """The layers of the picture that are still in the viewer."""
-        return [layer for kind, layer in self._layers.items() if _is_picture(kind) and self._has(layer)]
+    def images(self) -> list[Layer]:
+        """The layers of the image that are still in the viewer."""
+        return [layer for kind, layer in self._layers.items() if _is_image(kind) and self._has(layer)]
 
     @property
     def _has_time(self) -> bool:
-        """Whether the burst's layer has an axis of frames; the picture of one frame alone lies where the frame does."""
+        """Whether the burst's layer has an axis of frames; the image of one frame alone lies where the frame does."""
         return "T" in self.placement.axes
 
-    def show_picture(self, picture: NDArray[np.float32], acquisition: Acquisition, canvas: "Canvas") -> None:
-        """Show a picture (H, W) or (H, W, C) in intensity units, in the layers that are there for it, or new ones."""
-        for number, (kind, data, axes) in enumerate(self._parts(picture, acquisition)):
+    def show_image(self, image: NDArray[np.float32], acquisition: Acquisition, canvas: "Canvas") -> None:
+        """Show an image (H, W) or (H, W, C) in intensity units, in the layers that are there for it, or new ones."""
+        for number, (kind, data, axes) in enumerate(self._parts(image, acquisition)):
             placed = self.placement.on_canvas(axes, canvas)
             layer = self._layers.get(kind)
             if layer is None:
-                self._add_picture(kind, data, placed, self.placement.colormaps[number])
+                self._add_image(kind, data, placed, self.placement.colormaps[number])
                 self._outlined = time.perf_counter()
             elif self._has(layer):
                 if self._drawn_at is None or not np.array_equal(self._drawn_at, canvas.reference_from_image):
@@ -82,9 +82,9 @@ class RunLayers:
         self._drawn_at = canvas.reference_from_image
 
     def show_frames(self, homographies: NDArray[np.float64], shape: tuple[int, int]) -> None:
-        """Show, now and then, where each frame (H, W) lies on the picture: outlines, and a track of the centres."""
+        """Show, now and then, where each frame (H, W) lies on the image: outlines, and a track of the centres."""
         wait = max(_SECONDS_BETWEEN_OUTLINES, self._outlining / _OUTLINES_SHARE)
-        # The first layer of shapes can take seconds to come: the picture goes first, and is seen.
+        # The first layer of shapes can take seconds to come: the image goes first, and is seen.
         if not self._layers or time.perf_counter() - self._outlined < wait:
             return
         began, before = time.perf_counter(), len(self._layers)
@@ -111,10 +111,10 @@ class RunLayers:
         """
         self._common["homographies"] = result.homographies
         canvas, shape = result.canvas, result.acquisition.shape[1:3]
-        self.show_picture(result.image, result.acquisition, canvas)
+        self.show_image(result.image, result.acquisition, canvas)
         for kind, layer in self._layers.items():
-            # napari keeps layers of shapes that have been removed: what is large goes with the picture alone.
-            layer.metadata = self._metadata({"reconstruction": result} if _is_picture(kind) else {})
+            # napari keeps layers of shapes that have been removed: what is large goes with the image alone.
+            layer.metadata = self._metadata({"reconstruction": result} if _is_image(kind) else {})
         yield
         yield from self._put_frames(result.homographies, shape)
         if self._has_time:
@@ -166,19 +166,19 @@ class RunLayers:
         self._layers.clear()
 
     def _parts(
-        self, picture: NDArray[np.float32], acquisition: Acquisition
+        self, image: NDArray[np.float32], acquisition: Acquisition
     ) -> list[tuple[str, NDArray[np.float32], str]]:
-        """Return kind, data and axes of each layer that the picture takes."""
+        """Return kind, data and axes of each layer that the image takes."""
         if self.placement.channels:
             return [
-                (f"picture of {name}", *self.placement.arrange(picture[..., number], "YX"))
+                (f"image of {name}", *self.placement.arrange(image[..., number], "YX"))
                 for number, name in enumerate(self.placement.channels)
             ]
         if self.placement.rgb:
-            return [("picture", as_colour(picture, acquisition), "YX")]
-        return [("picture", *self.placement.arrange(picture, "YXC"[: picture.ndim]))]
+            return [("image", as_colour(image, acquisition), "YX")]
+        return [("image", *self.placement.arrange(image, "YXC"[: image.ndim]))]
 
-    def _add_picture(self, kind: str, data: NDArray[np.float32], placed: dict[str, Any], colormap: Any) -> None:
+    def _add_image(self, kind: str, data: NDArray[np.float32], placed: dict[str, Any], colormap: Any) -> None:
         more = {} if self.placement.rgb else {"colormap": colormap}
         limits = limits_of(data)
         if limits is not None and not self.placement.rgb:
@@ -190,7 +190,7 @@ class RunLayers:
             self._limits[kind] = tuple(self._layers[kind].contrast_limits)
 
     def _fit_contrast(self, kind: str, layer: Image, data: NDArray[np.float32]) -> None:
-        """Follow the picture with the contrast, until the user takes it in hand."""
+        """Follow the image with the contrast, until the user takes it in hand."""
         limits = limits_of(data)
         if kind not in self._limits or limits is None or tuple(layer.contrast_limits) != self._limits[kind]:
             return
@@ -231,7 +231,7 @@ class RunLayers:
         yield
 
     def _add(self, kind: str, array: Any, axes: str, canvas: "Canvas | None" = None, **look: Any) -> None:
-        """Add a hidden layer beneath the picture for something that comes with the result, where it came."""
+        """Add a hidden layer beneath the image for something that comes with the result, where it came."""
         if array is None or kind in self._layers or self._is_removed:
             return
         if "C" in axes and self.placement.channels:
@@ -240,7 +240,7 @@ class RunLayers:
             return
         data, axes = (array, axes) if look.get("rgb") else self.placement.arrange(array, axes)
         layer = Image(data, visible=False, **self.placement.on_canvas(axes, canvas), **look)
-        at = [self._viewer.layers.index(picture) for picture in self.pictures]
+        at = [self._viewer.layers.index(image) for image in self.images]
         self._insert(kind, layer, min(at, default=len(self._viewer.layers)))
 
     def _insert(self, kind: str, layer: Layer, at: int | None = None) -> None:
@@ -262,5 +262,5 @@ class RunLayers:
         return layer in self._viewer.layers
 
 
-def _is_picture(kind: str) -> bool:
-    return kind.startswith("picture")
+def _is_image(kind: str) -> bool:
+    return kind.startswith("image")

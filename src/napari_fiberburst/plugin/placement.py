@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
 
-# Parts of a picture's values that are let go below and above when its contrast is set.
+# Parts of an image's values that are let go below and above when its contrast is set.
 _DARKEST, _BRIGHTEST = 0.1, 99.9
 
 
@@ -141,17 +141,17 @@ class Placement:
         return [vertices.astype(np.float64) for vertices in found]
 
 
-def as_colour(picture: NDArray[np.float32], acquisition: Acquisition) -> NDArray[np.float32]:
-    """Return an RGB picture in intensity units as RGBA in [0, 1], see-through where it is NaN."""
+def as_colour(image: NDArray[np.float32], acquisition: Acquisition) -> NDArray[np.float32]:
+    """Return an RGB image in intensity units as RGBA in [0, 1], see-through where it is NaN."""
     span = acquisition.white_level - acquisition.black_level
-    known = np.isfinite(picture).all(axis=-1, keepdims=True)
-    scaled = np.clip((picture - acquisition.black_level) / span, 0, 1)
+    known = np.isfinite(image).all(axis=-1, keepdims=True)
+    scaled = np.clip((image - acquisition.black_level) / span, 0, 1)
     return np.concatenate([np.where(known, scaled, 0), known], axis=-1, dtype=np.float32)
 
 
-def limits_of(picture: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Return contrast limits that show a picture well; None where nothing in it differs."""
-    known = picture[np.isfinite(picture)]
+def limits_of(image: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Return contrast limits that show an image well; None where nothing in it differs."""
+    known = image[np.isfinite(image)]
     if known.size == 0:
         return None
     low, high = np.percentile(known, [_DARKEST, _BRIGHTEST])

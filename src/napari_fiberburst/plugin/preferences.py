@@ -21,7 +21,7 @@ class Preferences:
     device : str
         Where a new form computes.
     previews_per_second : float
-        How often a running picture is drawn at most.
+        How often a running image is drawn at most.
     """
 
     preset: str = "auto"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # The window is brought up to date ten times a second, or less often where that would take more than this part of the
 # time: where the canvas is drawn in software, as on remote desktops, the fit needs those processors.
 _MILLISECONDS = 100
-_PICTURES_SHARE, _WORDS_SHARE = 0.1, 0.04
+_IMAGES_SHARE, _WORDS_SHARE = 0.1, 0.04
 
 State = Literal["ready", "running", "paused", "stopping"]
 
@@ -53,7 +53,7 @@ class Runner(QObject):
         self._timer.setInterval(_MILLISECONDS)
         self._timer.timeout.connect(self._look)
         self._looked = self._drawn = self._drawing = 0.0
-        self._has_picture = False
+        self._has_image = False
 
     @property
     def job(self) -> Job | None:
@@ -80,7 +80,7 @@ class Runner(QObject):
         self._set(state="running")
         self.started.emit(job)
         self._drawn = self._drawing = 0.0
-        self._has_picture = False
+        self._has_image = False
         self._timer.start()
         worker.start()
 
@@ -120,17 +120,17 @@ class Runner(QObject):
             return
         now = time.perf_counter()
         for box, signal, share in (
-            (job.previews, self.previewed, _PICTURES_SHARE),
+            (job.previews, self.previewed, _IMAGES_SHARE),
             (job.reports, self.reported, _WORDS_SHARE),
         ):
             if self._job is not job:
                 return  # napari's progress bar processes events, the end of the run among them
-            # The first picture is what a user waits for.
-            is_first = box is job.previews and not self._has_picture
+            # The first image is what a user waits for.
+            is_first = box is job.previews and not self._has_image
             is_due = last or is_first or now - self._drawn >= self._drawing / share
             report = box.take() if is_due else None
             if report is not None:
-                self._has_picture = self._has_picture or report.preview is not None
+                self._has_image = self._has_image or report.preview is not None
                 signal.emit(report)
                 self._show_progress(report)
                 self._looked = now

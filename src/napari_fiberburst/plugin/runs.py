@@ -48,7 +48,7 @@ class KeptRun:
     python : str
         The call, as lines of Python.
     bundle : BundleSource or None
-        The bundle that it was given; calibrated, where it was a picture and the run has ended.
+        The bundle that it was given; calibrated, where it was an image and the run has ended.
     source : BurstSource
         The burst.
     choices : dict
@@ -56,7 +56,7 @@ class KeptRun:
     layers : RunLayers
         In the viewer.
     history : History
-        The pictures on the way.
+        The images on the way.
     turned_live : list of (float, str, object)
         Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
@@ -177,7 +177,7 @@ class RunsPanel(QWidget):
         self._follow()
 
     def save_result(self, run: KeptRun, path: str | Path) -> None:
-        """Write a run's picture and its provenance, or say why not."""
+        """Write a run's image and its provenance, or say why not."""
         result = run.result
         if result is not None:
             _try(lambda: result.save(path), path)
@@ -288,11 +288,11 @@ class RunsPanel(QWidget):
         self._follow()
 
     def _show_a_or_b(self, is_b: bool) -> None:
-        """Show the picture of one run, A or B, and hide those of all others."""
+        """Show the image of one run, A or B, and hide those of all others."""
         self.compare_button.setText("B / A" if is_b else "A / B")
         shown = self.other.currentData() if is_b else self.run
         for run in self._runs:
-            run.layers.set_visible("picture", run is shown)
+            run.layers.set_visible("image", run is shown)
 
     def _ask_and_save(self) -> None:
         run = self.run

@@ -1,4 +1,4 @@
-"""Stacks of one picture a frame that are only made for the frame that is shown."""
+"""Stacks of one image a frame that are only made for the frame that is shown."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,7 @@ def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas")
 
 
 def residual_maps(residuals: NDArray[np.float32], labels: NDArray[np.int32]) -> da.Array:
-    """Return by how much the model misses each core in each frame, as pictures (T, H, W); NaN outside all cores.
+    """Return by how much the model misses each core in each frame, as images (T, H, W); NaN outside all cores.
 
     Parameters
     ----------

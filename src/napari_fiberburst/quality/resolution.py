@@ -1,4 +1,4 @@
-"""Resolution by Fourier ring correlation (Saxton & Baumeister, 1982): to what period two pictures agree."""
+"""Resolution by Fourier ring correlation (Saxton & Baumeister, 1982): to what period two images agree."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ THRESHOLD = 1 / 7
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingCorrelation:
-    """Agreement of two pictures, frequency by frequency.
+    """Agreement of two images, frequency by frequency.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class RingCorrelation:
 def ring_correlation(
     first: NDArray[np.floating], second: NDArray[np.floating], weight: NDArray[np.floating] | None = None
 ) -> RingCorrelation:
-    """Correlate two pictures of one object, made from independent data, over rings of their spectra.
+    """Correlate two images of one object, made from independent data, over rings of their spectra.
 
     Parameters
     ----------
@@ -45,16 +45,16 @@ def ring_correlation(
     Raises
     ------
     ValueError
-        The pictures differ in shape.
+        The images differ in shape.
     """
     if first.shape != second.shape or first.ndim != 2:
-        raise ValueError(f"expected two pictures (H, W) of one shape; got {first.shape} and {second.shape}")
+        raise ValueError(f"expected two images (H, W) of one shape; got {first.shape} and {second.shape}")
     height, width = first.shape
     window = np.hanning(height)[:, None] * np.hanning(width)[None, :]
     window = window if weight is None else window * weight
     # Filtering both leaves their correlation as it is. The Laplacian flattens their spectra, whose low frequencies
     # would leak through the window into the high ones.
-    spectra = [np.fft.fft2(laplace(picture.astype(np.float64), mode="nearest") * window) for picture in (first, second)]
+    spectra = [np.fft.fft2(laplace(image.astype(np.float64), mode="nearest") * window) for image in (first, second)]
     radius = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.fftfreq(width)[None, :])
     rings = max(4, min(height, width) // 4)
     number = np.minimum((radius * 2 * rings).astype(int), rings)

@@ -1,4 +1,4 @@
-"""What a picture rests on: what was measured, how well, and what was filled in."""
+"""What an image rests on: what was measured, how well, and what was filled in."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -11,15 +11,15 @@ from napari_fiberburst.bundle.bundle import Bundle
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Diagnostics:
-    """What is known of a reconstruction beside its picture; None where the method does not tell.
+    """What is known of a reconstruction beside its image; None where the method does not tell.
 
     Attributes
     ----------
     coverage : numpy.ndarray or None
-        (H, W) float32 on the canvas: how many core samples have seen each pixel; 0 where the picture is filled in
+        (H, W) float32 on the canvas: how many core samples have seen each pixel; 0 where the image is filled in
         from its surroundings.
     uncertainty : numpy.ndarray or None
-        (H, W) float32 on the canvas, the standard deviation to be expected of the picture, intensity units, averaged
+        (H, W) float32 on the canvas, the standard deviation to be expected of the image, intensity units, averaged
         over the channels. It holds what noise and gaps do, not what a wrong model does.
     bundle : Bundle or None
         The bundle as this burst shows it: where it is in these frames, with gains as they were taken out. It can be
@@ -39,11 +39,11 @@ class Diagnostics:
     confidence : numpy.ndarray or None
         (T,) 0 to 1, how well each frame agrees with the others where they overlap; NaN where the run ended before.
     reference : int
-        The frame in whose pixels picture and homographies are: 0, unless that frame could not be used.
+        The frame in whose pixels image and homographies are: 0, unless that frame could not be used.
     resolution : float or None
         Frame pixels, the finest period on which two halves of the burst agree (Fourier ring correlation of 1/7).
     notes : tuple of str
-        What a user should know before trusting the picture.
+        What a user should know before trusting the image.
     """
 
     coverage: NDArray[np.float32] | None = None
@@ -60,7 +60,7 @@ class Diagnostics:
     notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
-        """Return what is not a picture, as plain values that JSON can hold."""
+        """Return what is not an image, as plain values that JSON can hold."""
         bundle = self.bundle
         return {
             "held_out_rmse": self.held_out_rmse,

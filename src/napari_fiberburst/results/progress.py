@@ -34,7 +34,7 @@ class Progress:
     canvas : Canvas
         Where the preview lies in frame-0 pixels; a union of all frames grows with what is known of their motion.
     preview : numpy.ndarray or None
-        The picture as of now, in the burst's intensity units, (H, W) or (H, W, C) float32; None where this
+        The image as of now, in the burst's intensity units, (H, W) or (H, W, C) float32; None where this
         report has none.
     held_out_rmse : float or None
         Root mean square by which samples that were left out of the fit are missed, in the burst's intensity units;

@@ -1,4 +1,4 @@
-"""Reconstruction: the picture a burst gave, how its frames lie on it, and where it all came from."""
+"""Reconstruction: the image a burst gave, how its frames lie on it, and where it all came from."""
 
 from dataclasses import dataclass, field
 from operator import index
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.io.results import is_representation, write_picture, write_representation
+from napari_fiberburst.io.results import is_representation, write_image, write_representation
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.settings import Settings
 
@@ -23,18 +23,18 @@ Ending = Literal["finished", "stopped", "time budget", "diverged"]
 def draw(renderer: "Renderer", canvas: Canvas, frame: int, acquisition: Acquisition) -> NDArray[np.float32]:
     """Draw the scene as `frame` sees it, on a canvas in that frame's pixels, in the recording's intensity units.
 
-    Rows are drawn some at a time, so that what is in memory beside the picture does not grow with it.
+    Rows are drawn some at a time, so that what is in memory beside the image does not grow with it.
     """
     height, width = canvas.shape
     band = max(1, _BAND_PIXELS // width)
-    picture = np.empty((height, width, acquisition.shape[3]), np.float32)
+    image = np.empty((height, width, acquisition.shape[3]), np.float32)
     for first in range(0, height, band):
-        picture[first : first + band] = renderer.render(canvas.points(first, first + band), frame)
-    return acquisition.in_original_units(picture)
+        image[first : first + band] = renderer.render(canvas.points(first, first + band), frame)
+    return acquisition.in_original_units(image)
 
 
 class Renderer(Protocol):
-    """What a solver hands over to make pictures of the scene it has fitted."""
+    """What a solver hands over to make images of the scene it has fitted."""
 
     def render(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
         """Return the scene as `frame` sees it, (H, W, C) in [0, 1], at that frame's pixels `points` (H, W, 2)."""
@@ -48,7 +48,7 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reconstruction(Diagnostics):
-    """A clean picture of the scene, the motion of the burst, and how they were made.
+    """A clean image of the scene, the motion of the burst, and how they were made.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Reconstruction(Diagnostics):
 
     Notes
     -----
-    What the picture rests on (`coverage`, `uncertainty`, `held_out_rmse`, `cores` and more) is described at
+    What the image rests on (`coverage`, `uncertainty`, `held_out_rmse`, `cores` and more) is described at
     `napari_fiberburst.results.diagnostics.Diagnostics`. "Frame 0" stands for the frame `reference` wherever that is
     another.
     """
@@ -115,7 +115,7 @@ class Reconstruction(Diagnostics):
         Parameters
         ----------
         scale : float
-            Picture pixels to a frame-0 pixel; 2 doubles both sides.
+            Image pixels to a frame-0 pixel; 2 doubles both sides.
         bounds : (float, float, float, float), optional
             x0, y0, x1, y1 in frame-0 pixels, half-open; default frame 0's field. They may reach beyond it, where
             only other frames have looked, or none. Behind a calibrated bundle what no core has looked at is NaN; a
@@ -142,7 +142,7 @@ class Reconstruction(Diagnostics):
         t : int
             Frame number; negative ones count from the end.
         scale : float
-            Picture pixels to a frame pixel.
+            Image pixels to a frame pixel.
 
         Returns
         -------
@@ -181,7 +181,7 @@ class Reconstruction(Diagnostics):
         return self.renderer.displacement(Canvas.over(self._field).points(), self._number(t))
 
     def provenance(self) -> dict[str, Any]:
-        """Return where the picture came from, as plain values that JSON can hold; None stands for NaN."""
+        """Return where the image came from, as plain values that JSON can hold; None stands for NaN."""
         return {
             "requested": self.requested.to_dict(),
             "settings": self.settings.to_dict(),
@@ -204,7 +204,7 @@ class Reconstruction(Diagnostics):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the picture, or the fitted networks themselves.
+        """Write the image, or the fitted networks themselves.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class Reconstruction(Diagnostics):
         """
         if is_representation(Path(path)):
             return write_representation(path, self.renderer.arrays(), self.provenance())
-        return write_picture(path, self.image, self.acquisition, self.provenance())
+        return write_image(path, self.image, self.acquisition, self.provenance())
 
     @property
     def _field(self) -> tuple[float, float, float, float]:

@@ -67,18 +67,18 @@ class SplineImage:
         bands = [map_coordinates(band, at, np.float32, 3, _BEYOND, prefilter=False) for band in self._coefficients]
         return self.masked(np.stack(bands, axis=-1) + np.float32(self.black), points, frame)
 
-    def masked(self, picture: NDArray[np.float32], points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
-        """Return a picture (H, W, C) drawn at a frame's pixels, NaN off the scene, and where no core looked near."""
+    def masked(self, image: NDArray[np.float32], points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
+        """Return an image (H, W, C) drawn at a frame's pixels, NaN off the scene, and where no core looked near."""
         places = torch.from_numpy(self._mapped(points, frame).astype(np.float32)).to(self.scene.device)
         sampling = self.grid.at(places)
         far = ~sampling.inside
         if not self._fill:
             far |= sampling(self._distance()) > self._reach
-        return np.where(far.cpu().numpy()[..., None], np.float32(np.nan), picture)
+        return np.where(far.cpu().numpy()[..., None], np.float32(np.nan), image)
 
     @cached_property
     def _coefficients(self) -> list[NDArray[np.float32]]:
-        """Each channel as a cubic spline, which does not dull the picture between its nodes as a linear one would."""
+        """Each channel as a cubic spline, which does not dull the image between its nodes as a linear one would."""
         return [spline_filter(band, 3, np.float32, _BEYOND) for band in self.scene.cpu().numpy()]
 
     @property
@@ -88,7 +88,7 @@ class SplineImage:
 
     @property
     def reference(self) -> int:
-        """The first frame that takes part: the picture is in its pixels."""
+        """The first frame that takes part: the image is in its pixels."""
         return int(np.flatnonzero(self.used)[0])
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
@@ -107,7 +107,7 @@ class SplineImage:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]], device: torch.device) -> "SplineImage":
-        """Rebuild a picture from `arrays`."""
+        """Rebuild an image from `arrays`."""
         x0, y0, spacing = arrays["nodes"].tolist()
         reach, fill, black = arrays["drawing"].tolist()
         rows, columns = arrays["known"].shape

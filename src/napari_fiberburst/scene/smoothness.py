@@ -18,7 +18,7 @@ from napari_fiberburst.scene.spline import NormalEquations
 # Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
 _CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
 _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
-# A picture this rough has hardly any bias left: it stands for the truth that the other half's pictures are held to.
+# An image this rough has hardly any bias left: it stands for the truth that the other half's images are held to.
 _REFERENCE = 0.01
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
@@ -99,7 +99,7 @@ def choose_among_neighbours(
     """Choose the smoothness by which each core is best predicted from those around it.
 
     For a burst that does not move. Its halves share every gap, and what cores differ by: neither half tells which part
-    of the other's picture is object and which is core. Between neighbours, cores differ at random and the object does
+    of the other's image is object and which is core. Between neighbours, cores differ at random and the object does
     not, so the smoothness that predicts cores left out (cross-validation in folds) takes out what is the cores'.
 
     Parameters are those of `choose_smoothness`; one frame is enough.

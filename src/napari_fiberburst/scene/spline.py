@@ -11,7 +11,7 @@ same for ten frames and for a thousand.
 Points take the membrane prior, of slopes; footprints the thin plate's, of curvature: it falls off faster beyond the
 detail that is there, which undoing a blur needs.
 
-Between its nodes a linear spline falls short of a smooth picture, so one that fits samples everywhere overshoots at
+Between its nodes a linear spline falls short of a smooth image, so one that fits samples everywhere overshoots at
 the nodes, by a fifth at a period of four. `NormalEquations.image` takes that out.
 """
 
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
-from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_pictures
+from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_images
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
@@ -127,12 +127,12 @@ class NormalEquations:
             start=(start,),
             iterations=iterations,
             tolerance=_TOLERANCE,
-            inner=inner_of_pictures,
+            inner=inner_of_images,
         )
         return scene
 
     def image(self, scene: Tensor, smoothness: float) -> Tensor:
-        """Return the smooth picture that a solution (C, H, W) stands for, at the nodes.
+        """Return the smooth image that a solution (C, H, W) stands for, at the nodes.
 
         Reading a wave of frequency f by linear interpolation at the distance d from a node, as a part of the spacing,
         gives it the gain (1 - d) cos(2 pi f d) + d cos(2 pi f (1 - d)). Over all samples that has the mean R and the

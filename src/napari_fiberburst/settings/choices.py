@@ -9,7 +9,7 @@ from napari_fiberburst.settings.parameter import check, parameter
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoEncoding:
-    """The coordinates as they are: a smooth picture without fine detail."""
+    """The coordinates as they are: a smooth image without fine detail."""
 
     name: ClassVar[str] = "none"
 

@@ -32,9 +32,9 @@ _RATE = "Step size of Adam; more is faster and less stable. None suits the encod
 # Without slots, because a class with slots cannot have two such bases.
 @dataclass(frozen=True, kw_only=True)
 class _Drawn:
-    """What every method lets a user choose of its picture."""
+    """What every method lets a user choose of its image."""
 
-    upsample: float = parameter(1.0, "Picture pixels to a frame pixel, along each axis.", above=0, most=16)
+    upsample: float = parameter(1.0, "Image pixels to a frame pixel, along each axis.", above=0, most=16)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +47,9 @@ class _BehindBundle(_Drawn):
         "shows.",
     )
     canvas: Literal["frame", "union"] = parameter(
-        "frame", "What the picture covers: the first frame's field, or all that any frame saw."
+        "frame", "What the image covers: the first frame's field, or all that any frame saw."
     )
-    fill: bool = parameter(False, "Fill in the picture where no core has looked, instead of leaving it empty (NaN).")
+    fill: bool = parameter(False, "Fill in the image where no core has looked, instead of leaving it empty (NaN).")
     held_out: float = parameter(
         0.05, "Part of the samples that is left out of the fit and tells how well it predicts.", least=0, most=0.5
     )

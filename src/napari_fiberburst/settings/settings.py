@@ -31,16 +31,14 @@ class Settings:
     """
 
     method: Method = field(default_factory=SplineMethod)
-    seed: int = parameter(
-        0, "Seed of everything random; the same seed gives the same picture.", least=0, most=2**31 - 1
-    )
+    seed: int = parameter(0, "Seed of everything random; the same seed gives the same image.", least=0, most=2**31 - 1)
     device: str = parameter("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
     time_budget: float | None = parameter(
         None, "Seconds after which to stop with what there is; None for no limit.", above=0
     )
     preview_every: float | None = parameter(
         None,
-        "Seconds between preview pictures while fitting, or more where drawing would slow the fit; None makes none.",
+        "Seconds between preview images while fitting, or more where drawing would slow the fit; None makes none.",
         above=0,
     )
 

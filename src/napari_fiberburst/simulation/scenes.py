@@ -1,4 +1,4 @@
-"""What there is to see: pictures that scikit-image brings along, at their own resolution, and drawn ones."""
+"""What there is to see: images that scikit-image brings along, at their own resolution, and drawn ones."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,17 +21,17 @@ _MARGIN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A picture without bundle or motion, known everywhere.
+    """An image without bundle or motion, known everywhere.
 
     Parameters
     ----------
-    picture : numpy.ndarray
+    image : numpy.ndarray
         (H, W, C) float32 in [0, 1].
     origin : (float, float)
-        The picture's pixel (x, y) that lies at frame 0's pixel (0, 0).
+        The image's pixel (x, y) that lies at frame 0's pixel (0, 0).
     """
 
-    picture: NDArray[np.float32]
+    image: NDArray[np.float32]
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -43,10 +43,10 @@ class Scene:
     @property
     def channels(self) -> int:
         """Number of channels."""
-        return int(self.picture.shape[2])
+        return int(self.image.shape[2])
 
     def sample(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return the scene (..., C) at frame-0 points (..., 2) by splines, reflected beyond the picture."""
+        """Return the scene (..., C) at frame-0 points (..., 2) by splines, reflected beyond the image."""
         x, y = points[..., 0] + self.origin[0], points[..., 1] + self.origin[1]
         coefficients: list[NDArray[np.float32]] = self._coefficients  # type: ignore[attr-defined]
         bands = [
@@ -63,13 +63,13 @@ class Scene:
         if channels == self.channels:
             return self
         if channels == 1:
-            return Scene(self.picture.mean(axis=2, keepdims=True), self.origin)
+            return Scene(self.image.mean(axis=2, keepdims=True), self.origin)
         positions = np.linspace(0, self.channels - 1, channels)
         mixing = np.array([np.interp(positions, range(self.channels), row) for row in np.eye(self.channels)])
-        return Scene((self.picture @ mixing).astype(np.float32), self.origin)
+        return Scene((self.image @ mixing).astype(np.float32), self.origin)
 
     def _bands(self) -> list[NDArray[np.float32]]:
-        return [self.picture[..., band] for band in range(self.channels)]
+        return [self.image[..., band] for band in range(self.channels)]
 
 
 def make_scene(name: str, shape: tuple[int, int], rng: Generator) -> Scene:
@@ -109,11 +109,11 @@ def usaf_chart(shape: tuple[int, int], rng: Generator, *, size: float | None = N
     size : float, optional
         Side of the chart in pixels; default 0.9 of the frame's shorter side.
     """
-    picture, origin = _blank(shape, 1.0)
+    image, origin = _blank(shape, 1.0)
     size = size or 0.9 * min(shape)
     centre_x, centre_y = origin[0] + (shape[1] - 1) / 2, origin[1] + (shape[0] - 1) / 2
-    _draw_group_pair(picture, centre_x, centre_y, size / _PAIR_SIDE)
-    light = (0.05 + 0.85 * np.clip(picture, 0, 1)).astype(np.float32)
+    _draw_group_pair(image, centre_x, centre_y, size / _PAIR_SIDE)
+    light = (0.05 + 0.85 * np.clip(image, 0, 1)).astype(np.float32)
     return Scene(light.repeat(3, axis=2), origin)
 
 
@@ -122,7 +122,7 @@ _PAIR_SIDE = 26.0
 _GAP = 1.5
 
 
-def _draw_group_pair(picture: NDArray[np.float32], x: float, y: float, width: float) -> None:
+def _draw_group_pair(image: NDArray[np.float32], x: float, y: float, width: float) -> None:
     """Draw groups g and g + 1 around (x, y); `width` is that of a bar of element 1 of group g, pixels."""
     if width < 0.5:
         return
@@ -131,40 +131,40 @@ def _draw_group_pair(picture: NDArray[np.float32], x: float, y: float, width: fl
     down = top
     for element in range(2, 7):  # group g, elements 2 to 6, down the left side
         bar = width * 2 ** (-(element - 1) / 6)
-        _draw_element(picture, left, down, bar)
+        _draw_element(image, left, down, bar)
         down += 5 * bar + _GAP * bar
-    _draw_element(picture, right - 12 * width, bottom - 5 * width, width)  # group g, element 1, bottom right
+    _draw_element(image, right - 12 * width, bottom - 5 * width, width)  # group g, element 1, bottom right
     down = top
     for element in range(1, 7):  # group g + 1 down the right side
         bar = width / 2 * 2 ** (-(element - 1) / 6)
-        _draw_element(picture, right - 12 * bar, down, bar)
+        _draw_element(image, right - 12 * bar, down, bar)
         down += 5 * bar + _GAP * bar
-    _draw_group_pair(picture, x + 2 * width, y - 3 * width, width / 4)
+    _draw_group_pair(image, x + 2 * width, y - 3 * width, width / 4)
 
 
-def _draw_element(picture: NDArray[np.float32], left: float, top: float, bar: float) -> None:
+def _draw_element(image: NDArray[np.float32], left: float, top: float, bar: float) -> None:
     """Draw three horizontal bars, then, two bar widths on, three vertical ones."""
     if bar < 0.5:
         return
     for index in (0, 2, 4):
-        _darken(picture, left, left + 5 * bar, top + index * bar, top + (index + 1) * bar)
+        _darken(image, left, left + 5 * bar, top + index * bar, top + (index + 1) * bar)
         beside = left + 7 * bar
-        _darken(picture, beside + index * bar, beside + (index + 1) * bar, top, top + 5 * bar)
+        _darken(image, beside + index * bar, beside + (index + 1) * bar, top, top + 5 * bar)
 
 
-def _darken(picture: NDArray[np.float32], left: float, right: float, top: float, bottom: float) -> None:
+def _darken(image: NDArray[np.float32], left: float, right: float, top: float, bottom: float) -> None:
     """Take a rectangle's light away, pixel edges by the area they lose."""
     rows, columns = (
         np.clip(np.minimum(np.arange(length) + 0.5, stop) - np.maximum(np.arange(length) - 0.5, start), 0, 1)
-        for length, start, stop in ((picture.shape[0], top, bottom), (picture.shape[1], left, right))
+        for length, start, stop in ((image.shape[0], top, bottom), (image.shape[1], left, right))
     )
-    picture[..., 0] -= np.outer(rows, columns).astype(np.float32)
+    image[..., 0] -= np.outer(rows, columns).astype(np.float32)
 
 
 def fibrous_tissue(shape: tuple[int, int], rng: Generator, *, fibres: float = 0.004) -> Scene:
     """Draw curved fibres of several widths and colours, bright on dark, `fibres` to a pixel of area."""
-    picture, origin = _blank(shape, 0.0)
-    height, width = picture.shape[:2]
+    image, origin = _blank(shape, 0.0)
+    height, width = image.shape[:2]
     glow = np.zeros((height, width, 3), np.float32)
     colours = np.array([[0.9, 0.5, 0.3], [0.5, 0.9, 0.5], [0.4, 0.6, 1.0]], np.float32)
     for thickness, colour in zip((0.8, 1.4, 2.6), colours, strict=True):
@@ -182,11 +182,11 @@ def fibrous_tissue(shape: tuple[int, int], rng: Generator, *, fibres: float = 0.
 
 def _photograph(load: Callable[[], NDArray[np.uint8]]) -> Callable[[tuple[int, int], Generator], Scene]:
     def scene(shape: tuple[int, int], rng: Generator) -> Scene:
-        picture = load()
-        starts = [(have - want) / 2 for have, want in zip(picture.shape[:2], shape, strict=True)]
+        image = load()
+        starts = [(have - want) / 2 for have, want in zip(image.shape[:2], shape, strict=True)]
         firsts = [max(0, math.floor(start - _MARGIN * want)) for start, want in zip(starts, shape, strict=True)]
         lasts = [math.ceil(start + (1 + _MARGIN) * want) for start, want in zip(starts, shape, strict=True)]
-        part = picture[firsts[0] : lasts[0], firsts[1] : lasts[1]]
+        part = image[firsts[0] : lasts[0], firsts[1] : lasts[1]]
         y0, x0 = (math.floor(start) - first for start, first in zip(starts, firsts, strict=True))
         return Scene(part.astype(np.float32) / np.float32(255), (x0, y0))
 
@@ -194,7 +194,7 @@ def _photograph(load: Callable[[], NDArray[np.uint8]]) -> Callable[[tuple[int, i
 
 
 def _blank(shape: tuple[int, int], value: float) -> tuple[NDArray[np.float32], tuple[int, int]]:
-    """Return an even one-channel picture with room around a frame, and where the frame starts in it."""
+    """Return an even one-channel image with room around a frame, and where the frame starts in it."""
     margin_y, margin_x = (math.ceil(_MARGIN * side) for side in shape)
     padded = (shape[0] + 2 * margin_y, shape[1] + 2 * margin_x, 1)
     return np.full(padded, value, np.float32), (margin_x, margin_y)

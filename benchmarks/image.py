@@ -22,9 +22,9 @@ def main() -> None:
     before = burst.acquisition.in_original_units(burst.frames[result.reference])[y0:y1, x0:x1]
     after = result.render(bounds=(x0, y0, x1, y1), scale=2)
     shown = []
-    for picture in (np.repeat(np.repeat(before, 2, axis=0), 2, axis=1), after):
-        low, high = np.nanpercentile(picture, [0.5, 99.5])
-        level = np.nan_to_num((picture - low) / (high - low))
+    for image in (np.repeat(np.repeat(before, 2, axis=0), 2, axis=1), after):
+        low, high = np.nanpercentile(image, [0.5, 99.5])
+        level = np.nan_to_num((image - low) / (high - low))
         shown.append(np.rint(np.clip(level, 0, 1) * 255).astype(np.uint8))
     gap = np.full((shown[0].shape[0], 12, *shown[0].shape[2:]), 255, np.uint8)
     Image.fromarray(np.concatenate([shown[0], gap, shown[1]], axis=1)).save(options.output)
