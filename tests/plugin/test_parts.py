@@ -162,7 +162,7 @@ def test_outlines_follow_every_other_axis():
 def test_colour_is_see_through_where_nothing_was_seen(tiny_burst):
     drawn = np.full((2, 2, 3), 51.0, np.float32)
     drawn[0, 0, 1] = np.nan
-    shown = as_colour(image, tiny_burst.acquisition)
+    shown = as_colour(drawn, tiny_burst.acquisition)
     np.testing.assert_allclose(shown[1, 1], [0.2, 0.2, 0.2, 1])
     np.testing.assert_array_equal(shown[0, 0], 0)
     assert limits_of(np.full((3, 3), np.nan, np.float32)) is None

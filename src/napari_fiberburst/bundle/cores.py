@@ -15,14 +15,14 @@ from napari_fiberburst.operators.filters import blur, local_mean
 
 # In pitches: how far from all cores a place is a gap in the lattice.
 _GAP = 0.85
-# A core is a blob: two Gaussians of these spreads, in pitches, subtracted. Plain peaks would miss a dim core that leans
-# on a bright one.
+# A core is a blob: two Gaussians of these widths (1 sigma, in pitches), subtracted. Plain peaks would miss a dim core
+# that leans on a bright one.
 _INNER, _OUTER = 0.15, 0.3
 # The mean profile is a broken line with knots this far apart, out to where neighbours of neighbours begin; what lies
 # within the second reach is a core's own. In pitches. So many pixels are plenty.
 _PROFILE_STEP, _PROFILE_REACH, _OWN_REACH = 0.1, 1.3, 0.7
 _PROFILE_PIXELS = 20_000
-# How strong a blob is a core, in parts of the light about it; and how much light there must be about it, for noise
+# How strong a blob is a core, in parts of the light about it; and how much light there must be about it, because noise
 # outside the bundle has blobs too.
 _LEAST_BLOB = 0.06
 _LEAST_LIGHT = 0.15
@@ -87,7 +87,7 @@ def brightest(transmission: Tensor, labels: Tensor, count: int, pitch: float) ->
 
 
 def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitch: float) -> float:
-    """Return the radius, in pixels, of the disc with the spread of the mean core's profile.
+    """Return the radius, in pixels, of the disc with the variance of the mean core's profile.
 
     A core gathers light over the area through which it emits it. Profiles of neighbours overlap, so the mean profile is
     unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for all cores (least

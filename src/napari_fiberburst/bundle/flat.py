@@ -70,15 +70,15 @@ def _with_dark(bundle: Bundle, darkness: Tensor, acquisition: Acquisition) -> Bu
 
 def _with_channels(bundle: Bundle, frames: Tensor, acquisition: Acquisition) -> Bundle:
     """Return the bundle with the gains of its cores in each channel, and how well they are known."""
-    seen = sample_cores(frames, bundle, acquisition)
-    mass = seen.weights.sum(dim=0)
-    values = (seen.values * seen.weights[..., None]).sum(dim=0) / mass.clamp_min(1e-9)[:, None]
+    samples = sample_cores(frames, bundle, acquisition)
+    mass = samples.weights.sum(dim=0)
+    values = (samples.values * samples.weights[..., None]).sum(dim=0) / mass.clamp_min(1e-9)[:, None]
     gains = values / values.mean(dim=1, keepdim=True).clamp_min(1e-9)
     # What channels differ by in all cores is the colour of the light, and no gain.
     gains = gains / gains.median(dim=0).values.clamp_min(1e-9)
     usable = (values > 0).all(dim=1) & (mass > 0)
     gains = torch.where(usable[:, None], gains, torch.ones_like(gains)).clamp(_LEAST_GAIN, _MOST_GAIN)
-    weights = (seen.weights * seen.values.mean(dim=2).square()).sum(dim=0) * usable
+    weights = (samples.weights * samples.values.mean(dim=2).square()).sum(dim=0) * usable
     return replace(
         bundle,
         gains=gains.cpu().numpy().astype(np.float32),

@@ -72,7 +72,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class Observed:
     """What frames show of a bundle.
 
     Attributes
@@ -112,20 +112,20 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     mean = grey[exposed(grey)].mean(dim=0)
     black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
     flat, lit = (part.cpu() for part in _flattened((mean - black).clamp_min(0), bundle.pitch))
-    seen = Seen(image=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
-    if len(seen.cores) < _LEAST_CORES:
+    observed = Observed(image=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
+    if len(observed.cores) < _LEAST_CORES:
         raise BundleError(
-            f"the frames show {len(seen.cores)} cores, too few to tell where the bundle is (expected at least "
+            f"the frames show {len(observed.cores)} cores, too few to tell where the bundle is (expected at least "
             f"{_LEAST_CORES}); expose longer, or leave the bundle out"
         )
-    best = _refined(np.eye(3), bundle, seen)
-    found = _agreement(best, bundle, seen)
+    best = _refined(np.eye(3), bundle, observed)
+    found = _agreement(best, bundle, observed)
     if not _is_it(found):
-        best = _refined(_searched(bundle, seen), bundle, seen)
-        found = _agreement(best, bundle, seen)
+        best = _refined(_searched(bundle, observed), bundle, observed)
+        found = _agreement(best, bundle, observed)
     if not _is_it(found):
-        raise BundleError(_otherwise(bundle, seen, found))
-    zoom = _zoom(best, bundle, seen)
+        raise BundleError(_otherwise(bundle, observed, found))
+    zoom = _zoom(best, bundle, observed)
     if abs(zoom - 1) > _MOST_ZOOM:
         raise BundleError(
             f"the frames show this bundle at {zoom:.3f} times the size it was calibrated at; expected 1 to within "
@@ -134,9 +134,9 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     return _placed(bundle, best)
 
 
-def _otherwise(bundle: Bundle, seen: Seen, found: tuple[float, float]) -> str:
+def _otherwise(bundle: Bundle, observed: Observed, found: tuple[float, float]) -> str:
     """Return why the frames do not show the bundle."""
-    apart = _spacing(seen.cores) / _spacing(bundle.centres)
+    apart = _spacing(observed.cores) / _spacing(bundle.centres)
     if abs(apart - 1) > _MOST_SPACING:
         return (
             f"the frames show another bundle, or this one at another zoom: cores are {apart:.2f} times as far apart as "
@@ -194,7 +194,7 @@ def _flattened(image: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
     return torch.where(lit, image / envelope.clamp_min(1e-6), torch.zeros_like(image)), lit
 
 
-def _searched(bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
+def _searched(bundle: Bundle, observed: Observed) -> NDArray[np.float64]:
     """Return the rigid motion, of those searched, at which the images correlate best: (3, 3), frame from bundle."""
     expected = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     height, width = bundle.shape
@@ -202,7 +202,7 @@ def _searched(bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
     most = MOST_ROTATION + _MARGIN_ROTATION
     angles = np.arange(-np.ceil(most / step), np.ceil(most / step) + 1) * step
     reach = int(np.ceil(MOST_SHIFT + _MARGIN_SHIFT))
-    spectrum = np.fft.rfft2(seen.image - seen.image.mean())
+    spectrum = np.fft.rfft2(observed.image - observed.image.mean())
     best, score = np.eye(3), -np.inf
     for angle in angles:
         motion = _rigid(np.radians(angle), (0.0, 0.0), (width, height))
@@ -231,7 +231,7 @@ def _rigid(angle: float, shift: tuple[float, float], size: tuple[int, int]) -> N
 
 
 def _matches(
-    motion: NDArray[np.float64], bundle: Bundle, seen: Seen, reach: float
+    motion: NDArray[np.float64], bundle: Bundle, observed: Observed, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """Return cores of the bundle and where the frames show them, (M, 2) each, and how many could have been shown.
 
@@ -239,29 +239,29 @@ def _matches(
     """
     there = transform_points(motion, bundle.centres)
     column, row = np.rint(there).astype(int).clip(0, np.array(bundle.shape[::-1]) - 1).T
-    could = ((there >= 1) & (there <= np.array(bundle.shape[::-1]) - 2)).all(axis=1) & seen.lit[row, column]
-    distance, number = (np.asarray(part) for part in cKDTree(seen.cores).query(there))
+    could = ((there >= 1) & (there <= np.array(bundle.shape[::-1]) - 2)).all(axis=1) & observed.lit[row, column]
+    distance, number = (np.asarray(part) for part in cKDTree(observed.cores).query(there))
     near = could & (distance < reach)
-    return bundle.centres[near], seen.cores[number[near]], int(could.sum())
+    return bundle.centres[near], observed.cores[number[near]], int(could.sum())
 
 
-def _refined(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> NDArray[np.float64]:
+def _refined(motion: NDArray[np.float64], bundle: Bundle, observed: Observed) -> NDArray[np.float64]:
     """Return the rigid motion that brings the cores to where they are seen (Kabsch, 1976), by shrinking circles."""
     for reach in (0.5, 0.4, 0.3, _NEAR, _NEAR):
-        here, there, _ = _matches(motion, bundle, seen, reach * bundle.pitch)
+        here, there, _ = _matches(motion, bundle, observed, reach * bundle.pitch)
         if len(here) < 8:
             return motion
         first, second = here.mean(axis=0), there.mean(axis=0)
         u, _, v = np.linalg.svd((here - first).T @ (there - second))
-        turn = v.T @ np.diag([1, np.linalg.det(v.T @ u.T)]) @ u.T
+        rotation = v.T @ np.diag([1, np.linalg.det(v.T @ u.T)]) @ u.T
         motion = np.eye(3)
-        motion[:2, :2], motion[:2, 2] = turn, second - turn @ first
+        motion[:2, :2], motion[:2, 2] = rotation, second - rotation @ first
     return motion
 
 
-def _zoom(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> float:
+def _zoom(motion: NDArray[np.float64], bundle: Bundle, observed: Observed) -> float:
     """Return how much larger than calibrated the pattern of matched cores is."""
-    here, there, _ = _matches(motion, bundle, seen, _NEAR * bundle.pitch)
+    here, there, _ = _matches(motion, bundle, observed, _NEAR * bundle.pitch)
     if len(here) < 8:
         return 1.0
     here, there = here - here.mean(axis=0), there - there.mean(axis=0)
@@ -269,14 +269,14 @@ def _zoom(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> float:
     return float((turned * there).sum() / (turned**2).sum())
 
 
-def _agreement(motion: NDArray[np.float64], bundle: Bundle, seen: Seen) -> tuple[float, float]:
+def _agreement(motion: NDArray[np.float64], bundle: Bundle, observed: Observed) -> tuple[float, float]:
     """Return the share of cores found in their places, and the correlation of their brightness with the bundle's."""
-    here, there, count = _matches(motion, bundle, seen, _NEAR * bundle.pitch)
+    here, there, count = _matches(motion, bundle, observed, _NEAR * bundle.pitch)
     if len(here) < 8:
         return 0.0, 0.0
     flat = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     known, shown = (
-        map_coordinates(image, points.T[::-1], order=1) for image, points in ((flat, here), (seen.image, there))
+        map_coordinates(image, points.T[::-1], order=1) for image, points in ((flat, here), (observed.image, there))
     )
     near = np.asarray(cKDTree(here).query(here, k=7)[1])
     known, shown = (values - values[near[:, 1:]].mean(axis=1) for values in (known, shown))

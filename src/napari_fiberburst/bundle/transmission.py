@@ -37,9 +37,9 @@ def remeasure(bundle: Bundle, grey: Tensor, acquisition: Acquisition, predicted:
     pixels = own.nonzero().flip(1).to(grey.dtype)
     light, power = torch.zeros(len(pixels)).to(grey), torch.full((len(pixels),), 1e-9).to(grey)
     for number, frame in enumerate(grey):
-        seen = predicted(number, pixels)
-        light += (frame[own] - known.black) * seen
-        power += seen**2
+        expected = predicted(number, pixels)
+        light += (frame[own] - known.black) * expected
+        power += expected**2
     transmission = torch.zeros_like(known.transmission)
     enough = power > _LEAST_LIGHT * power.mean()
     fallback = known.transmission[own] * (light[enough].sum() / power[enough].sum().clamp_min(1e-9))

@@ -57,25 +57,25 @@ def find_shifts(
     Parameters
     ----------
     positions : Tensor
-        (N, 2) of the sensors, frame pixels.
+        (N, 2) of the cores or blocks of pixels, frame pixels.
     values, weights : Tensor
         (T, N).
     shape : (int, int)
         Height and width of a frame.
     pitch : float
-        Distance of sensors, pixels.
+        Distance of neighbouring positions, pixels.
     """
     spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
     images, mask = _images(positions, values, weights, shape, spacing, max(0.5, 0.6 * pitch / spacing))
     correlation = _Correlation(images, mask)
     count = len(images)
     scores = np.zeros((count, count))
-    ways = np.zeros((count, count, 2))
+    shifts = np.zeros((count, count, 2))
     for first, second in _pairs(count):
-        way, score = correlation.best(first, second)
+        shift, score = correlation.best(first, second)
         scores[first, second] = scores[second, first] = score
-        ways[first, second], ways[second, first] = way, -way
-    return _span(scores, ways * spacing)
+        shifts[first, second], shifts[second, first] = shift, -shift
+    return _span(scores, shifts * spacing)
 
 
 def confidence(
@@ -163,18 +163,18 @@ class _Correlation:
         score = joint / norm.sqrt().clamp_min(1e-12) * share.clamp(0, 1) ** 0.25
         score = torch.where(share > _LEAST_OVERLAP, score, torch.full_like(score, -1))
         place = int(score.argmax())
-        way = [place % self._shape[1], place // self._shape[1]]
+        shift = [place % self._shape[1], place // self._shape[1]]
         for axis, side in enumerate(self._shape[::-1]):
-            way[axis] -= side if way[axis] > side // 2 else 0
-        return -np.array(way, dtype=np.float64), max(0.0, float(score.max()))
+            shift[axis] -= side if shift[axis] > side // 2 else 0
+        return -np.array(shift, dtype=np.float64), max(0.0, float(score.max()))
 
     def _correlate(self, first: Tensor, second: Tensor) -> Tensor:
         correlated: Tensor = torch.fft.irfft2(first.conj() * second, s=self._shape)
         return correlated
 
 
-def _span(scores: NDArray[np.float64], ways: NDArray[np.float64]) -> CoarseShifts:
-    """Tie frames to one another along the tree of the best pairs; `ways[i, j]` leads from frame j's pixels to i's."""
+def _span(scores: NDArray[np.float64], shifts: NDArray[np.float64]) -> CoarseShifts:
+    """Tie frames to one another along the tree of the best pairs; `shifts[i, j]` leads from frame j's pixels to i's."""
     count = len(scores)
     root = int(np.argmax(np.median(scores, axis=1)))
     shifts = np.zeros((count, 2))
@@ -186,7 +186,7 @@ def _span(scores: NDArray[np.float64], ways: NDArray[np.float64]) -> CoarseShift
         known, new = np.unravel_index(int(open_pairs.argmax()), open_pairs.shape)
         if scores[known, new] < LEAST_CONFIDENCE:
             break
-        shifts[new] = shifts[known] + ways[known, new]
+        shifts[new] = shifts[known] + shifts[known, new]
         trust[new] = scores[known, new]
         connected[new] = True
     trust[root] = trust.max()

@@ -26,7 +26,7 @@ from napari_fiberburst.operators.priors import MEMBRANE
 
 # In medians of the residuals: larger ones count less (Huber, 1964).
 _HUBER = 2.5
-# Variance of the gains about 1 that is expected before anything is seen: bundles measured have 15 to 20 % (1 sigma).
+# Variance of the gains about 1 that is expected a priori: bundles measured have 15 to 20 % (1 sigma).
 _GAIN_VARIANCE = 0.04
 # A gain further from 1 than this factor is not believed.
 _LARGEST_GAIN = 50.0
@@ -202,7 +202,7 @@ def iterate(problem: JointProblem, state: JointState, level: Level, number: int)
     Returns
     -------
     JointState, float
-        The new state, and the longest way that the centre of a frame went, pixels.
+        The new state, and the largest displacement of a frame's centre, pixels.
     """
     damping = max(level.damping * level.decay**number, _LEAST_DAMPING)
     system = _Linearised.of(problem, state, level.smoothness, min(level.dof, problem.dof), damping)
@@ -217,8 +217,8 @@ def iterate(problem: JointProblem, state: JointState, level: Level, number: int)
 
 def normalise(problem: JointProblem, state: JointState) -> JointState:
     """Return the state with what all gains have in common moved into the scene: their median is 1."""
-    seen = torch.bincount(problem.core_index, minlength=problem.cores) > 0
-    common = state.gains[seen].median()
+    measured = torch.bincount(problem.core_index, minlength=problem.cores) > 0
+    common = state.gains[measured].median()
     return replace(state, gains=state.gains / common, scene=state.scene * common)
 
 

@@ -87,7 +87,7 @@ class FrameMotion:
         return FrameMotion(matrices / matrices[:, 2:, 2:], self.shape)
 
     def travel(self, steps: Tensor) -> float:
-        """Return the longest way that a frame's centre goes by its step (T, k), pixels."""
+        """Return the largest displacement of a frame's centre by its step (T, k), pixels."""
         return float(steps[:, :2].detach().cpu().double().norm(dim=1).max()) * self._half
 
     def where(self, chosen: NDArray[np.bool_], other: "FrameMotion") -> "FrameMotion":

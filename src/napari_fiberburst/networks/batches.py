@@ -38,7 +38,7 @@ class Batch(NamedTuple):
 
     Notes
     -----
-    Behind a bundle, points are (N, K, 2): K points of a sensor's footprint, of which it sees the mean.
+    Behind a bundle, points are (N, K, 2): K points of a core's footprint, of which it sees the mean.
     """
 
     points: Tensor

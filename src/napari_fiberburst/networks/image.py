@@ -72,7 +72,7 @@ class Representation:
         return image if self.behind is None else self.behind.masked(image + self.behind.black, points, frame)
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
+        """Return the displacement of each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
         if frame == 0 and self.behind is None:
             return np.zeros_like(points)
 

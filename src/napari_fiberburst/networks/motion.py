@@ -56,11 +56,11 @@ class MotionField(nn.Module, ABC):
         Frame 0's own map is inverted by fixed-point iteration, which converges where that map bends by less
         than its argument moves.
         """
-        seen = self(points, frames)
+        target = self(points, frames)
         first = torch.zeros_like(frames)
-        found = seen
+        found = target
         for _ in range(_INVERSION_STEPS):
-            missed = seen - self(found, first)
+            missed = target - self(found, first)
             found = found + missed
         return torch.where(missed.abs().amax(dim=1, keepdim=True) < _INVERSION_TOLERANCE, found, torch.nan)
 

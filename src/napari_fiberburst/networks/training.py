@@ -154,8 +154,8 @@ class Problem:
             predicted = self.field(batch.points, batch.frames)
         else:
             count, each, _ = batch.points.shape
-            seen = self.field(batch.points.reshape(-1, 2), batch.frames.repeat_interleave(each))
-            predicted = seen.reshape(count, each, -1).mean(dim=1)
+            light = self.field(batch.points.reshape(-1, 2), batch.frames.repeat_interleave(each))
+            predicted = light.reshape(count, each, -1).mean(dim=1)
         square = (predicted - batch.intensities).square()
         if batch.weights is None:
             mean: Tensor = square.mean()

@@ -106,15 +106,15 @@ def _held_to_others(
     generator = torch.Generator().manual_seed(0)
     signs = (2 * torch.randint(2, (samples.cores,), generator=generator) - 1).to(points)[samples.core_index]
     light = torch.zeros_like(samples.weights)
-    for seen in predict(samples, points, scene.grid, scene.filtered.mean(dim=0, keepdim=True)):
-        light[seen.frame] = seen.light[:, 0]
+    for part in predict(samples, points, scene.grid, scene.filtered.mean(dim=0, keepdim=True)):
+        light[part.frame] = part.light[:, 0]
     wrong = replace(samples, values=(signs * light)[..., None])
     equations = assemble(scene.grid, wrong, points)
     followed = equations.through(equations.solve(scene.smoothness, equations.mean(), _PROBE_ITERATIONS))
     agreement = power = torch.zeros(()).to(points)
-    for seen in predict(wrong, points, scene.grid, followed):
-        agreement = agreement + (seen.weights * (seen.values * seen.light)[:, 0]).sum()
-        power = power + (seen.weights * seen.values[:, 0] ** 2).sum()
+    for part in predict(wrong, points, scene.grid, followed):
+        agreement = agreement + (part.weights * (part.values * part.light)[:, 0]).sum()
+        power = power + (part.weights * part.values[:, 0] ** 2).sum()
     free = min(max(1 - float(agreement / power.clamp_min(1e-12)), _LEAST_FREE), 1.0)
     return (1 + (ratios - 1) / free).clamp_min(0), weights * free
 
@@ -146,8 +146,8 @@ def _coverage(
     places = _places(canvas, points)
     count = torch.zeros(grid.shape).to(places)
     for number in np.flatnonzero(registration.used):
-        seen = samples.weights[number] > 0
-        count += grid.at(points[number, seen]).adjoint(torch.ones(int(seen.sum())).to(places))
+        used = samples.weights[number] > 0
+        count += grid.at(points[number, used]).adjoint(torch.ones(int(used.sum())).to(places))
     if samples.radius is None:
         coverage = grid.at(places)(count) / grid.spacing**2
     else:

@@ -144,7 +144,7 @@ class Display(QObject):
         return state, past
 
     def _add_layer(self) -> None:
-        """Add the next layer that waits; the window has a turn between two of them."""
+        """Add the next layer that waits; the window handles its events between two of them."""
         if next(self._layers_to_come, self) is self:
             self._timer.stop()
 

@@ -177,7 +177,7 @@ class Job:
         if self._truth is None or report.preview is None or not is_frame or is_soon:
             return None
         if not np.allclose(report.homographies[0], np.eye(3), atol=1e-6):
-            return None  # the image is over another frame, for frame 0 is of no use
+            return None  # the image is over another frame, because frame 0 is of no use
         scores = score(report.preview, report.homographies, self._truth)
         self._scored = time.perf_counter()
         self._scoring = self._scored - began

@@ -24,10 +24,10 @@ def match_levels(image: NDArray[np.floating], truth: NDArray[np.floating]) -> ND
         raise ValueError(f"image and truth must have one shape; got {image.shape} and {truth.shape}")
     channels = image.shape[2] if image.ndim == 3 else 1
     given, wanted = (np.asarray(array, np.float64).reshape(-1, channels) for array in (image, truth))
-    spread = given - given.mean(axis=0)
-    power = (spread**2).mean(axis=0)
-    gain = np.divide((spread * wanted).mean(axis=0), power, out=np.zeros(channels), where=power > 0)
-    matched: NDArray[np.float64] = (wanted.mean(axis=0) + gain * spread).reshape(image.shape)
+    centred = given - given.mean(axis=0)
+    power = (centred**2).mean(axis=0)
+    gain = np.divide((centred * wanted).mean(axis=0), power, out=np.zeros(channels), where=power > 0)
+    matched: NDArray[np.float64] = (wanted.mean(axis=0) + gain * centred).reshape(image.shape)
     return matched
 
 

@@ -40,7 +40,7 @@ class Renderer(Protocol):
         """Return the scene as `frame` sees it, (H, W, C) in [0, 1], at that frame's pixels `points` (H, W, 2)."""
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        """Return the way from each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
+        """Return the displacement of each of a frame's pixels `points` to its frame-0 pixel, (H, W, 2) in pixels."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the fitted parameters by name."""

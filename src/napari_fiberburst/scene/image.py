@@ -92,7 +92,7 @@ class SplineImage:
         return int(np.flatnonzero(self.used)[0])
 
     def displacement(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        """Return the way from each of a frame's pixels `points` to its reference pixel, (H, W, 2) in pixels."""
+        """Return the displacement of each of a frame's pixels `points` to its reference pixel, (H, W, 2) in pixels."""
         return self._mapped(points, frame) - points
 
     def arrays(self) -> dict[str, NDArray[Any]]:

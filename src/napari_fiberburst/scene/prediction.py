@@ -63,7 +63,7 @@ def misfit(
 ) -> tuple[float, float]:
     """Return the weighted sum of squares by which a scene misses samples, and the sum of the weights."""
     total = mass = torch.zeros((), dtype=torch.float64)
-    for seen in predict(samples, points, grid, filtered, among):
-        total = total + (seen.weights[:, None] * (seen.values - seen.light) ** 2).sum().cpu().double()
-        mass = mass + seen.weights.sum().cpu().double() * seen.values.shape[1]
+    for part in predict(samples, points, grid, filtered, among):
+        total = total + (part.weights[:, None] * (part.values - part.light) ** 2).sum().cpu().double()
+        mass = mass + part.weights.sum().cpu().double() * part.values.shape[1]
     return float(total), float(mass)

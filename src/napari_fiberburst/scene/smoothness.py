@@ -50,13 +50,13 @@ def choose_smoothness(
     """Choose the smoothness by which each half of the burst best predicts the scene of the other.
 
     Even and odd frames are solved apart. The squared difference between the scene from one half, at each smoothness,
-    and a nearly unbiased scene from the other is that scene's error plus a constant, for the halves' noise is
+    and a nearly unbiased scene from the other is that scene's error plus a constant, because the halves' noise is
     independent. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that matter.
 
     Parameters
     ----------
     samples, points
-        What is seen, and where (T, N, 2).
+        The samples, and where they lie (T, N, 2).
     frames : numpy.ndarray
         Numbers of the frames that take part, at least two.
     grid : Grid
@@ -74,8 +74,8 @@ def choose_smoothness(
         halves.append(normal)
     densities = [blur(half.density(), 3.0) for half in halves]
     both = torch.minimum(*densities)
-    seen = (both > 0.2 * both.max()) & (both > 0)
-    if not bool(seen.any()):
+    sampled = (both > 0.2 * both.max()) & (both > 0)
+    if not bool(sampled.any()):
         return Smoothness(UNTOLD, None)
     paths = [
         [half.image(scene, smoothness) for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)]
@@ -83,11 +83,11 @@ def choose_smoothness(
     ]
     reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
     risks = [
-        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, seen].mean())
+        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, sampled].mean())
         for first, second in zip(*paths, strict=True)
     ]
     weight, nearest = _lowest(np.array(risks), _CANDIDATES)
-    soft = (blur(seen.to(scene), 4.0) * seen).cpu().numpy()
+    soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
     first, second = (path[nearest][0].cpu().numpy() for path in paths)
     resolution = window.spacing * ring_correlation(first, second, soft).resolution
     return Smoothness(weight, resolution if math.isfinite(resolution) else None)

@@ -1,6 +1,6 @@
 """The scene as a linear spline, solved by conjugate gradients.
 
-Given motion and gains, what sensors see is linear in the scene's nodes s, so the best scene solves
+Given motion and gains, what cores (or pixels) see is linear in the scene's nodes s, so the best scene solves
 
     (B S^T W S B + lambda P) s = B S^T W v
 
@@ -200,14 +200,14 @@ class NormalEquations:
         return self.footprint.transfer(along_y, along_x)
 
 
-def _read_gain(frequency: Tensor, spread: Tensor) -> tuple[Tensor, Tensor]:
+def _read_gain(frequency: Tensor, offset_variance: Tensor) -> tuple[Tensor, Tensor]:
     """Return mean square and mean of the gain with which waves (F,), cycles per node, are read along one axis.
 
-    `spread` is the mean of d (1 - d) over the samples: 0 where all lie on nodes, 1/6 where they lie anywhere. The mean
-    gain is exact for any mixture of the two.
+    `offset_variance` is the mean of d (1 - d) over the samples: 0 where all lie on nodes, 1/6 where they lie
+    anywhere. The mean gain is exact for any mixture of the two.
     """
-    square = 1 - 2 * spread * (1 - torch.cos(2 * math.pi * frequency))
-    return square, 1 - 6 * spread * (1 - torch.sinc(frequency) ** 2)
+    square = 1 - 2 * offset_variance * (1 - torch.cos(2 * math.pi * frequency))
+    return square, 1 - 6 * offset_variance * (1 - torch.sinc(frequency) ** 2)
 
 
 def assemble(grid: Grid, samples: Samples, points: Tensor, among: Tensor | None = None) -> NormalEquations:

@@ -97,7 +97,7 @@ class Translation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Similarity:
-    """One shift, turn and scale per frame."""
+    """One shift, rotation and scale per frame."""
 
     name: ClassVar[str] = "similarity"
     dof: ClassVar[int] = 4
@@ -105,7 +105,7 @@ class Similarity:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Affine:
-    """One affine transform per frame: shift, turn, scale and shear."""
+    """One affine transform per frame: shift, rotation, scale and shear."""
 
     name: ClassVar[str] = "affine"
     dof: ClassVar[int] = 6

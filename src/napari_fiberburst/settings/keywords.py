@@ -11,7 +11,7 @@ OBSERVATION = Parameter(
     name="observation",
     kind=str,
     default="auto",
-    doc="What is taken as one sensor behind the self-calibrated bundle: each core, each lit pixel, or, auto, what the "
+    doc="What is taken as one sample behind the self-calibrated bundle: each core, each lit pixel, or, auto, what the "
     "burst itself shows; frames stands for the published method, which has no bundle model.",
     choices=("auto", "cores", "pixels", "frames"),
 )

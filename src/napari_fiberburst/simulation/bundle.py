@@ -13,7 +13,7 @@ from scipy.special import erfc
 
 from napari_fiberburst.errors import SettingsError
 
-# Cores end in an edge of this spread, pixels.
+# Cores end in a Gaussian edge of this sigma, pixels.
 _EDGE = 0.3
 
 
@@ -58,8 +58,8 @@ class Bundle:
 
     def transmission(self, shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return what the camera sees of an even white scene, (H, W) in [0, 1]."""
-        seen: NDArray[np.float64] = (self.profiles(shape) @ self.gains).reshape(shape)
-        return np.minimum(seen, 1)
+        image: NDArray[np.float64] = (self.profiles(shape) @ self.gains).reshape(shape)
+        return np.minimum(image, 1)
 
     def mix(self, light: NDArray[np.floating]) -> NDArray[np.floating]:
         """Return each core's light (N, C) with its neighbours' share in it."""

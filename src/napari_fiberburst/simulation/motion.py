@@ -110,7 +110,7 @@ def handheld_motion(
     margin = math.ceil(4 * smoothness)
     noise = rng.standard_normal((6, frames + 2 * margin))
     smooth = gaussian_filter1d(noise, smoothness, axis=1)[:, margin : margin + frames]
-    # White noise filtered by a Gaussian of this width keeps this much of its spread.
+    # White noise filtered by a Gaussian of this width keeps this much of its standard deviation.
     smooth *= math.sqrt(2 * math.sqrt(math.pi) * smoothness)
     spreads = [translation * side] * 2 + [math.radians(rotation), scale] + [perspective / side] * 2
     parts = smooth * np.array(spreads)[:, None]

@@ -114,20 +114,20 @@ def simulate(
     camera = camera or Camera()
     # One generator for each part, so that a change of one leaves the others as they were.
     scene_rng, motion_rng, bundle_rng, camera_rng = np.random.default_rng(seed).spawn(4)
-    seen = scene if isinstance(scene, Scene) else make_scene(scene, shape, scene_rng)
-    seen = seen.with_channels(seen.channels if channels is None else channels)
+    world = scene if isinstance(scene, Scene) else make_scene(scene, shape, scene_rng)
+    world = world.with_channels(world.channels if channels is None else channels)
     homographies = _motion(motion, frames, shape, motion_rng)
     cores = make_bundle(shape, bundle_rng, **bundle)
     rows, columns = np.indices(shape, dtype=np.float64)
     pixels = np.stack([columns, rows], axis=-1)
-    truth = np.stack([seen.sample(_apply(matrix, pixels)) for matrix in homographies])
+    truth = np.stack([world.sample(_apply(matrix, pixels)) for matrix in homographies])
     transmission = cores.transmission(shape)
     if physics == "mask":
         light = truth * transmission.astype(np.float32)[..., None]
     else:
         light = _through_cores(truth, cores)
     recorded = camera.record(light, camera_rng)
-    grey = seen.channels == 1
+    grey = world.channels == 1
     pixels, axes = (recorded[..., 0], "TYX") if grey else (recorded, "TYXC")
     return SimulatedBurst(
         burst=Burst(pixels, axes=axes, black_level=0, white_level=camera.full_scale),
@@ -135,7 +135,7 @@ def simulate(
         homographies=homographies,
         transmission=transmission,
         bundle=cores,
-        scene=seen,
+        scene=world,
     )
 
 
