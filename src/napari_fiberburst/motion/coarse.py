@@ -70,12 +70,12 @@ def find_shifts(
     correlation = _Correlation(images, mask)
     count = len(images)
     scores = np.zeros((count, count))
-    shifts = np.zeros((count, count, 2))
+    pairwise = np.zeros((count, count, 2))
     for first, second in _pairs(count):
         shift, score = correlation.best(first, second)
         scores[first, second] = scores[second, first] = score
-        shifts[first, second], shifts[second, first] = shift, -shift
-    return _span(scores, shifts * spacing)
+        pairwise[first, second], pairwise[second, first] = shift, -shift
+    return _span(scores, pairwise * spacing)
 
 
 def confidence(
@@ -173,8 +173,8 @@ class _Correlation:
         return correlated
 
 
-def _span(scores: NDArray[np.float64], shifts: NDArray[np.float64]) -> CoarseShifts:
-    """Tie frames to one another along the tree of the best pairs; `shifts[i, j]` leads from frame j's pixels to i's."""
+def _span(scores: NDArray[np.float64], pairwise: NDArray[np.float64]) -> CoarseShifts:
+    """Tie frames together along the tree of the best pairs; `pairwise[i, j]` leads from frame j's pixels to i's."""
     count = len(scores)
     root = int(np.argmax(np.median(scores, axis=1)))
     shifts = np.zeros((count, 2))
@@ -186,7 +186,7 @@ def _span(scores: NDArray[np.float64], shifts: NDArray[np.float64]) -> CoarseShi
         known, new = np.unravel_index(int(open_pairs.argmax()), open_pairs.shape)
         if scores[known, new] < LEAST_CONFIDENCE:
             break
-        shifts[new] = shifts[known] + shifts[known, new]
+        shifts[new] = shifts[known] + pairwise[known, new]
         trust[new] = scores[known, new]
         connected[new] = True
     trust[root] = trust.max()
