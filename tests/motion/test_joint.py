@@ -1,4 +1,4 @@
-"""Scene, motion and gains are found together, and the Jacobian is that of the model."""
+"""Scene, motion, gains and exposures are found together, and the Jacobian is that of the model."""
 
 from dataclasses import replace
 
@@ -84,14 +84,16 @@ def test_the_jacobian_is_the_slope_of_the_model(positions, matrices, look, radiu
     problem = problem_of(positions.double(), values, dof=dof)
     gains = 1 + 0.1 * torch.randn(900, dtype=torch.float64)
     state = start(problem, FrameMotion(torch.from_numpy(matrices()), SHAPE))
-    state = replace(enter(problem, state, COARSE, radius), gains=gains)
+    exposures = 1 + 0.2 * torch.randn(5, dtype=torch.float64)
+    state = replace(enter(problem, state, COARSE, radius), gains=gains, exposures=exposures)
     # A scene without kinks at its nodes has one slope: linear interpolation of a plane.
     nodes = state.grid.nodes().double()
     state = replace(state, scene=1 + 0.004 * nodes[..., 0] - 0.003 * nodes[..., 1])
-    scene, motion, change = (
+    scene, motion, change, log_exposures = (
         torch.randn(state.grid.shape).double(),
         torch.randn(5, dof).double(),
         torch.randn(900).double(),
+        torch.randn(5).double(),
     )
     step = 1e-4
     moved = replace(
@@ -99,11 +101,30 @@ def test_the_jacobian_is_the_slope_of_the_model(positions, matrices, look, radiu
         scene=state.scene + step * scene,
         motion=state.motion.moved(step * motion),
         gains=state.gains + step * change,
+        exposures=state.exposures * (step * log_exposures).exp(),
     )
     slope = (predict(problem, moved) - predict(problem, state)) / step
-    expected = linearise(problem, state, dof)((scene, motion, change))
+    expected = linearise(problem, state, dof)((scene, motion, change, log_exposures))
     inside = ((positions > 12) & (positions < torch.tensor([127.0, 107.0]))).all(dim=1)
     torch.testing.assert_close(slope[:, inside], expected[:, inside], rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("flicker", [0.05, 0.3])
+def test_exposures_are_found(positions, matrices, look, flicker):
+    exposures = np.exp(flicker * np.array([0.9, -1.2, 0.4, 1.1, -0.7]))
+    gains = 1 + 0.15 * torch.randn(900, generator=torch.Generator().manual_seed(2))
+    values = look(positions, matrices()) * gains * torch.from_numpy(exposures).float()[:, None]
+    state = registered(problem_of(positions, values))
+    assert error(state.motion, matrices()) < 0.3
+    left = np.log(state.exposures.numpy() / exposures)
+    assert np.ptp(left) < 0.02
+    assert float(state.exposures.log().mean()) == pytest.approx(0, abs=1e-3)
+
+
+def test_an_even_burst_has_even_exposures(positions, matrices, look):
+    gains = 1 + 0.15 * torch.randn(900, generator=torch.Generator().manual_seed(2))
+    state = registered(problem_of(positions, look(positions, matrices()) * gains))
+    assert float(state.exposures.std()) < 0.004
 
 
 def test_an_iteration_lowers_what_is_left(positions, matrices, look):

@@ -38,6 +38,7 @@ def jacobian(dof, footprint):
         sampling=GRID.at(points(FRAMES, SAMPLES)),
         footprint=footprint,
         gains=random(SAMPLES),
+        exposures=random(FRAMES),
         light=random(FRAMES, SAMPLES),
         slopes=random(FRAMES, SAMPLES, dof),
         core_index=torch.arange(SAMPLES) % (CORES - 1),
@@ -58,7 +59,7 @@ def operators_to_test():
     yield "stencil", GRID.at(points(SAMPLES)).normal(random(SAMPLES)), scene, random(*GRID.shape)
     for dof in (2, 4, 6, 8):
         for through in (None, footprint):
-            blocks = (scene, random(FRAMES, dof), random(CORES))
+            blocks = (scene, random(FRAMES, dof), random(CORES), random(FRAMES))
             name = f"joint jacobian of {dof} generators, {'points' if through is None else 'footprints'}"
             yield name, jacobian(dof, through), blocks, samples
 

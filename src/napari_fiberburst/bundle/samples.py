@@ -85,6 +85,12 @@ class Samples(Stored):
             return replace(self, values=self.values / own[:, None], weights=self.weights * own**2)
         return replace(self, values=self.values / own, weights=self.weights * own.mean(dim=1) ** 2)
 
+    def without_exposures(self, exposures: Tensor) -> "Samples":
+        """Return the samples with each frame's exposure (T,), or (T, C), taken out of their values."""
+        per_channel = exposures if exposures.ndim == 2 else exposures[:, None]
+        weights = self.weights * per_channel.mean(dim=1, keepdim=True) ** 2
+        return replace(self, values=self.values / per_channel[:, None, :], weights=weights)
+
     def weighted(self, frames: Tensor) -> "Samples":
         """Return the samples with each frame's weights multiplied by that frame's in `frames`, (T,)."""
         return replace(self, weights=self.weights * frames.to(self.weights)[:, None])

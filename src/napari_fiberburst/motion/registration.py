@@ -87,6 +87,9 @@ class Registration(Stored):
         (T,) 0 to 1, how much each frame counts: blurred ones fit worse, and count less.
     gains : numpy.ndarray
         (G,) float32, gain of each core relative to what the samples assume; 1 where none was looked for.
+    exposures : numpy.ndarray
+        (T,) float32, brightness of each frame relative to the others: their geometric mean is 1, of frames that take
+        part.
     residual : float
         Root of the weighted mean square of what the model leaves of the samples, full scale 1; NaN before the first
         iteration.
@@ -109,6 +112,7 @@ class Registration(Stored):
     confidence: NDArray[np.float64]
     frame_weights: NDArray[np.float32]
     gains: NDArray[np.float32]
+    exposures: NDArray[np.float32]
     residual: float = float("nan")
     is_still: bool = False
     stage: Stage = "none"
@@ -126,6 +130,7 @@ class Registration(Stored):
             confidence=np.ones(count),
             frame_weights=np.ones(count, np.float32),
             gains=np.ones(cores, np.float32),
+            exposures=np.ones(count, np.float32),
             stage="complete",
         )
 
@@ -147,23 +152,24 @@ class Registration(Stored):
         return points
 
     def correct(self, samples: Samples) -> Samples:
-        """Return samples with the gains that were found taken out, and weighed by how far each frame is to be trusted.
+        """Return samples at gains and exposures of 1, and weighed by how far each frame is to be trusted.
 
         Parameters
         ----------
         samples : Samples
             Of the frames that were registered, by the bundle as it was before.
         """
-        gains = torch.from_numpy(self.gains).to(samples.values)
-        return samples.without_gains(gains).weighted(torch.from_numpy(self.frame_weights))
+        gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (self.gains, self.exposures))
+        frame_weights = torch.from_numpy(self.frame_weights)
+        return samples.without_gains(gains).without_exposures(exposures).weighted(frame_weights)
 
     def predicted(self, number: int, pixels: Tensor) -> Tensor:
-        """Return the grey light of the scene at pixels (N, 2) of frame `number`, full scale 1; 0 where unknown."""
+        """Return the grey light of the scene at pixels (N, 2) of frame `number`, as exposed; 0 where unknown."""
         if self.scene is None or not self.used[number]:
             return torch.zeros(len(pixels)).to(pixels)
         matrix = torch.from_numpy(self.scene_from_frame[number]).to(pixels)
         sampling = self.scene.grid.at(transform_points(matrix, pixels))
-        return sampling(self.scene.nodes) * self.scene.light
+        return sampling(self.scene.nodes) * (self.scene.light * float(self.exposures[number]))
 
 
 def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, seed: int = 0) -> Registration:
@@ -222,6 +228,7 @@ def unregistered(samples: Samples) -> Registration:
         confidence=np.full(count, np.nan),
         frame_weights=np.ones(count, np.float32),
         gains=np.ones(samples.cores, np.float32),
+        exposures=np.ones(count, np.float32),
     )
 
 
@@ -301,7 +308,7 @@ class _Search:
         light = _light(self.samples, found) if found.scene is None else found.scene.light
         problem = self._problem(found, light, most)
         motion = FrameMotion(torch.from_numpy(found.scene_from_frame), self.samples.shape)
-        state = start(problem, motion, None if found.scene is None else (found.scene.grid, found.scene.nodes))
+        state = start(problem, motion) if found.scene is None else self._resumed(found, found.scene, problem)
         for level in levels:
             if self._is_spent(found):
                 break
@@ -322,6 +329,17 @@ class _Search:
             state = normalise(problem, state)
         weights = _frame_weights(problem, state, found.used)
         return replace(self._registered(found, problem, state, light), frame_weights=weights)
+
+    def _resumed(self, found: Registration, scene: GreyScene, problem: JointProblem) -> JointState:
+        """Return the state where an earlier search has left off, all gains 1."""
+        gains = torch.ones(problem.cores, dtype=scene.nodes.dtype, device=scene.nodes.device)
+        return JointState(
+            motion=FrameMotion(torch.from_numpy(found.scene_from_frame), self.samples.shape),
+            grid=scene.grid,
+            scene=scene.nodes,
+            gains=gains,
+            exposures=torch.from_numpy(found.exposures).to(gains),
+        )
 
     def _is_spent(self, found: Registration) -> bool:
         return self.iterations is not None and found.iterations >= self.iterations
@@ -352,6 +370,7 @@ class _Search:
             found,
             scene_from_frame=state.motion.scene_from_frame.numpy().copy(),
             gains=state.gains.cpu().numpy() if is_every_core_asked else found.gains,
+            exposures=state.exposures.cpu().numpy(),
             residual=state.residual * light,
             scene=GreyScene(grid=state.grid, nodes=state.scene, light=light),
         )
@@ -377,7 +396,8 @@ def _judged(found: Registration, samples: Samples) -> Registration:
     """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
     samples = samples.weighted(torch.from_numpy(found.used))
     motion = FrameMotion(torch.from_numpy(found.scene_from_frame), samples.shape)
-    values = samples.grey / torch.from_numpy(found.gains).to(samples.values)[samples.core_index]
+    gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
+    values = samples.grey / (exposures[:, None] * gains[samples.core_index])
     agreement = confidence(samples.positions, values, samples.weights, motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
     used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))

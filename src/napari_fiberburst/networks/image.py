@@ -180,12 +180,17 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         reference=reference,
         held_out_rmse=provenance.get("held_out_rmse"),
         frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
-        confidence=None
-        if provenance.get("confidence") is None
-        else np.array(provenance["confidence"], dtype=np.float64),
+        confidence=_per_frame(provenance, "confidence"),
+        exposures=_per_frame(provenance, "exposures"),
         resolution=provenance.get("resolution"),
         notes=tuple(provenance.get("notes", ())),
     )
+
+
+def _per_frame(provenance: dict[str, Any], name: str) -> NDArray[np.float64] | None:
+    """Return one number a frame, NaN where the file has none; None where it does not know them."""
+    values = provenance.get(name)
+    return None if values is None else np.array(values, dtype=np.float64)
 
 
 def _rebuild_networks(

@@ -12,10 +12,10 @@ from napari_fiberburst.operators.grid import Sampling
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointJacobian:
-    """The Jacobian of v_tn = g_n (B s)(T_t x_n) in scene s, motion T and gains g.
+    """The Jacobian of v_tn = a_t g_n (B s)(T_t x_n) in scene s, motion T, gains g and exposures a.
 
-    Blocks are the changes of the scene (H, W), of the motion (T, k) along the generators of its model, and of the
-    gains (G,); samples are (T, N).
+    Blocks are the changes of the scene (H, W), of the motion (T, k) along the generators of its model, of the gains
+    (G,), and of the logarithms of the exposures (T,); samples are (T, N).
 
     Attributes
     ----------
@@ -25,10 +25,12 @@ class JointJacobian:
         B; None for points.
     gains : Tensor
         (N,) g_n, of each sample.
+    exposures : Tensor
+        (T,) a_t.
     light : Tensor
-        (T, N), (B s)(T_t x_n).
+        (T, N), a_t (B s)(T_t x_n).
     slopes : Tensor
-        (T, N, k), g_n times the slope of B s along each generator.
+        (T, N, k), a_t g_n times the slope of B s along each generator.
     core_index : Tensor
         (N,) int64, which of the gains each sample has.
     cores : int
@@ -38,6 +40,7 @@ class JointJacobian:
     sampling: Sampling
     footprint: Footprint | None
     gains: Tensor
+    exposures: Tensor
     light: Tensor
     slopes: Tensor
     core_index: Tensor
@@ -45,17 +48,23 @@ class JointJacobian:
 
     def __call__(self, blocks: Blocks) -> Tensor:
         """Return how the samples change."""
-        scene, motion, gains = blocks
+        scene, motion, gains, exposures = blocks
         filtered = scene if self.footprint is None else self.footprint(scene)
-        change = self.gains * self.sampling(filtered) + (self.slopes @ motion.unsqueeze(-1)).squeeze(-1)
-        return change + self.light * gains[self.core_index]
+        change = self.factors * self.sampling(filtered) + (self.slopes @ motion.unsqueeze(-1)).squeeze(-1)
+        return change + self.light * (gains[self.core_index] + self.gains * exposures[:, None])
 
     def adjoint(self, values: Tensor) -> Blocks:
-        """Return the adjoint's scene, motion and gains."""
-        scene = self.sampling.adjoint(values * self.gains)
+        """Return the adjoint's scene, motion, gains and exposures."""
+        scene = self.sampling.adjoint(values * self.factors)
         scene = scene if self.footprint is None else self.footprint.adjoint(scene)
         motion = (self.slopes.mT @ values.unsqueeze(-1)).squeeze(-1)
-        return scene, motion, self.per_core(values * self.light)
+        through = values * self.light
+        return scene, motion, self.per_core(through), through @ self.gains
+
+    @property
+    def factors(self) -> Tensor:
+        """(T, N), a_t g_n."""
+        return self.exposures[:, None] * self.gains
 
     def per_core(self, values: Tensor) -> Tensor:
         """Return the sum of values (T, N) over the samples of each core, (G,)."""

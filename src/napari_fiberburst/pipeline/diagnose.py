@@ -73,6 +73,7 @@ def diagnose(
         gain_weights=weights.cpu().numpy().astype(np.float32),
         frames_used=tuple(int(number) for number in np.flatnonzero(registration.used)),
         confidence=registration.confidence,
+        exposures=np.where(registration.used, registration.exposures, np.nan).astype(np.float64),
         reference=registration.reference,
         notes=notes,
     )

@@ -32,6 +32,9 @@ class Diagnostics:
     residuals : numpy.ndarray or None
         (T, N) float32, root mean square by which the model misses each core in each frame, intensity units; NaN
         where there is no sample.
+    exposures : numpy.ndarray or None
+        (T,) float64, brightness of each frame relative to the others, taken out of the image; their geometric mean is
+        1. NaN for frames that do not take part.
     held_out_rmse : float or None
         Root mean square by which samples that were left out of the fit are missed, intensity units.
     frames_used : tuple of int or None
@@ -52,6 +55,7 @@ class Diagnostics:
     gain_ratios: NDArray[np.float32] | None = None
     gain_weights: NDArray[np.float32] | None = None
     residuals: NDArray[np.float32] | None = None
+    exposures: NDArray[np.float64] | None = None
     held_out_rmse: float | None = None
     frames_used: tuple[int, ...] | None = None
     confidence: NDArray[np.float64] | None = None
@@ -65,9 +69,8 @@ class Diagnostics:
         return {
             "held_out_rmse": self.held_out_rmse,
             "frames_used": self.frames_used,
-            "confidence": None
-            if self.confidence is None
-            else [float(value) if np.isfinite(value) else None for value in self.confidence],
+            "confidence": _plain(self.confidence),
+            "exposures": _plain(self.exposures),
             "reference": self.reference,
             "resolution": self.resolution,
             "notes": self.notes,
@@ -87,3 +90,8 @@ class Diagnostics:
     def by_name(self) -> dict[str, Any]:
         """Return the diagnostics alone, by name."""
         return {item.name: getattr(self, item.name) for item in fields(Diagnostics)}
+
+
+def _plain(values: NDArray[np.float64] | None) -> list[float | None] | None:
+    """Return numbers as JSON can hold them, None for those that are not finite."""
+    return None if values is None else [float(value) if np.isfinite(value) else None for value in values]
