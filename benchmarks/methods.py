@@ -178,7 +178,7 @@ def oracle(case: Case, simulated: SimulatedBurst, effort: Effort) -> Outcome:
     start = time.perf_counter()
     burst, bundle = simulated.burst, Bundle.from_image(simulated.transmission)
     samples = sample(burst, bundle, "pixels" if case.physics == "mask" else "cores", device=effort.device)
-    known = Registration.known(simulated.homographies, samples.cores)
+    known = Registration.known(simulated.homographies, samples.shape, samples.cores)
     image = render(burst, bundle, known, solve(samples, known), fill=True)
     return Outcome(
         image=_in_full_scale(simulated, image),

@@ -8,18 +8,11 @@ import torch
 
 from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import find_shifts
-from napari_fiberburst.motion.joint import (
-    COARSE,
-    FINER,
-    JointProblem,
-    enter,
-    iterate,
-    linearise,
-    normalise,
-    predict,
-    start,
-)
+from napari_fiberburst.motion.displacement import ControlGrid, Displacement
+from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
+from napari_fiberburst.motion.linearised import linearise
 from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.motion.problem import COARSE, FINER, JointProblem
 
 SHAPE = (120, 140)
 PITCH = 5.0
@@ -104,9 +97,30 @@ def test_the_jacobian_is_the_slope_of_the_model(positions, matrices, look, radiu
         exposures=state.exposures * (step * log_exposures).exp(),
     )
     slope = (predict(problem, moved) - predict(problem, state)) / step
-    expected = linearise(problem, state, dof)((scene, motion, change, log_exposures))
+    expected = linearise(problem, state, replace(COARSE, dof=dof))((scene, motion, change, log_exposures))
     inside = ((positions > 12) & (positions < torch.tensor([127.0, 107.0]))).all(dim=1)
     torch.testing.assert_close(slope[:, inside], expected[:, inside], rtol=0.02, atol=0.02)
+
+
+@pytest.mark.parametrize("radius", [None, 2.3])
+def test_the_jacobian_of_control_points_is_the_slope_of_the_model(positions, matrices, look, radius):
+    torch.manual_seed(0)
+    grid = ControlGrid.over(SHAPE, 25.0)
+    controls = grid.at(positions.double())
+    problem = problem_of(positions.double(), look(positions, matrices()).double(), controls=controls)
+    control = torch.randn(5, 2, grid.shape[0] * grid.shape[1]).double()
+    motion = FrameMotion(torch.from_numpy(matrices()), SHAPE, Displacement(grid, control))
+    state = enter(problem, start(problem, motion), COARSE, radius)
+    nodes = state.grid.nodes().double()
+    state = replace(state, scene=1 + 0.004 * nodes[..., 0] - 0.003 * nodes[..., 1])
+    steps = torch.randn_like(control)
+    moved = replace(state, motion=replace(motion, displacement=Displacement(grid, control + 1e-4 * steps)))
+    slope = (predict(problem, moved) - predict(problem, state)) / 1e-4
+    level = replace(COARSE, bends=True)
+    unchanged = torch.zeros_like(state.scene), torch.zeros(900).double(), torch.zeros(5).double()
+    expected = linearise(problem, state, level)((unchanged[0], steps, *unchanged[1:]))
+    inside = ((positions > 12) & (positions < torch.tensor([127.0, 107.0]))).all(dim=1)
+    torch.testing.assert_close(slope[:, inside], expected[:, inside], rtol=0.02, atol=0.002)
 
 
 @pytest.mark.parametrize("flicker", [0.05, 0.3])

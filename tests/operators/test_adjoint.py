@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from napari_fiberburst import operators
+from napari_fiberburst.motion.displacement import ControlGrid
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid, Sampling
-from napari_fiberburst.operators.jacobian import JointJacobian
+from napari_fiberburst.operators.jacobian import ControlSlopes, GeneratorSlopes, JointJacobian
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
 from napari_fiberburst.operators.stencil import Stencil
 
@@ -32,7 +33,7 @@ def points(*shape):
     return scattered
 
 
-def jacobian(dof, footprint):
+def jacobian(motion, footprint):
     """Return the Jacobian of samples in three frames, some of which share a core, and one core has none."""
     return JointJacobian(
         sampling=GRID.at(points(FRAMES, SAMPLES)),
@@ -40,7 +41,7 @@ def jacobian(dof, footprint):
         gains=random(SAMPLES),
         exposures=random(FRAMES),
         light=random(FRAMES, SAMPLES),
-        slopes=random(FRAMES, SAMPLES, dof),
+        motion=motion,
         core_index=torch.arange(SAMPLES) % (CORES - 1),
         cores=CORES,
     )
@@ -61,7 +62,13 @@ def operators_to_test():
         for through in (None, footprint):
             blocks = (scene, random(FRAMES, dof), random(CORES), random(FRAMES))
             name = f"joint jacobian of {dof} generators, {'points' if through is None else 'footprints'}"
-            yield name, jacobian(dof, through), blocks, samples
+            yield name, jacobian(GeneratorSlopes(random(FRAMES, SAMPLES, dof)), through), blocks, samples
+    controls = ControlGrid(8.0, (7, 9))
+    weights = controls.at(points(SAMPLES).nan_to_num(3.0))
+    yield "control points", weights, random(FRAMES, 2, 63), random(FRAMES, 2, SAMPLES)
+    bending = ControlSlopes(random(FRAMES, SAMPLES), random(FRAMES, SAMPLES), weights)
+    blocks = (scene, random(FRAMES, 2, 63), random(CORES), random(FRAMES))
+    yield "joint jacobian of control points", jacobian(bending, footprint), blocks, samples
 
 
 def inner(first, second):
@@ -86,5 +93,5 @@ def test_every_operator_is_in_the_list():
         if hasattr(kind, "adjoint") and kind.__module__.startswith(operators.__name__)
         if not getattr(kind, "_is_protocol", False)
     }
-    assert defined == {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian}
+    assert defined == {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian, GeneratorSlopes, ControlSlopes}
     assert defined == {type(operator) for _, operator, _, _ in operators_to_test()}

@@ -14,6 +14,7 @@ from napari_fiberburst.settings import (
     MOTIONS,
     PUBLISHED_MOTIONS,
     Affine,
+    AutoMotion,
     Flow,
     FlowTV,
     Fourier,
@@ -66,7 +67,10 @@ def test_a_settings_object_stands_for_a_name():
     ("choices", "said"),
     [
         ({"preset": "papre"}, "known: auto, paper"),
-        ({"motion": "zoom"}, "known: none, translation, similarity, affine, homography, flow, flow_tv"),
+        (
+            {"motion": "zoom"},
+            "known: auto, none, translation, .*, homography, deformable, flow, flow_tv",
+        ),
         ({"encoding": "fuorier"}, "known: spline, none, nerf, fourier, hash, siren"),
         ({"encoding": Homography()}, "known: spline, none, nerf"),
         (
@@ -92,7 +96,7 @@ def test_a_settings_object_stands_for_a_name():
         ({"preset": "paper", "motion": "affine"}, "known: none, homography, flow, flow_tv"),
         ({"preset": "paper", "encoding": "spline"}, "needs a bundle model"),
         ({"preset": "paper", "canvas": "union"}, "canvas must be frame"),
-        ({"batch": 64}, "batch belongs to networks and does not apply to motion 'homography' with encoding 'spline'"),
+        ({"batch": 64}, "batch belongs to networks and does not apply to motion 'auto' with encoding 'spline'"),
         ({"encoding": "hash", "smoothness": 1.0}, "belongs to encoding 'spline' and does not apply"),
         ({"preset": "paper", "fill": True}, "belongs to a bundle model and does not apply to the published method"),
         ({"samples": "cores"}, "is no setting"),
@@ -123,8 +127,10 @@ def test_a_settings_object_refuses_a_part_that_is_none():
 @pytest.mark.parametrize("motion", MOTIONS)
 @pytest.mark.parametrize("encoding", ENCODING_NAMES)
 def test_settings_survive_json(motion, encoding):
-    if encoding == "spline" and motion.startswith("flow"):
+    if motion.startswith("flow") and encoding == "spline":
         encoding = "fourier"
+    if motion == "deformable":
+        encoding = "spline"
     settings = choose(motion=motion, encoding=encoding, iterations=5)
     assert Settings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
 
@@ -141,6 +147,14 @@ def test_the_observation_decides_what_a_homography_is():
     assert choose(observation="frames").method.motion == HomographyNetwork()
     assert choose("paper", observation="auto").method.motion == Homography()
     assert choose("paper", observation="cores").method.encoding == Fourier(sigma=5.0)
+
+
+def test_motion_that_is_open_is_what_is_usual_with_the_method():
+    assert choose(motion="auto").method.motion == AutoMotion()
+    assert choose(motion="auto", encoding="fourier").method.motion == Homography()
+    assert choose("paper", motion="auto").method.motion == HomographyNetwork()
+    with pytest.raises(SettingsError, match="unknown motion 'deformable'; known: none"):
+        choose(motion="deformable", encoding="fourier")
 
 
 def test_the_keywords_choose_the_method():
@@ -276,7 +290,7 @@ def test_settings_of_the_first_version_are_still_read(parts, method):
 
 
 def test_what_is_left_open_is_named():
-    assert choose().left_open == ("observation", "smoothness", "iterations", "device")
+    assert choose().left_open == ("motion", "observation", "smoothness", "iterations", "device")
     network = choose(encoding="fourier", observation="cores", iterations=5, batch=8, device="cpu", time_budget=1.0)
     assert network.left_open == ("sigma", "learning_rate")
     assert choose("paper").left_open == ("batch", "device")

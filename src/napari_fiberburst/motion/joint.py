@@ -1,12 +1,12 @@
 """Joint registration: scene, motion, gains and exposures of all frames solved together, by Gauss-Newton.
 
 Each sample n, at a fixed place x_n of the frame, has a gain g_n and sees the scene s, through its footprint B, where
-frame t's transform T_t takes it, at that frame's exposure a_t:
+frame t's transform T_t and displacement D_t take it, at that frame's exposure a_t:
 
-    v_tn = a_t g_n (B s)(T_t x_n) + noise
+    v_tn = a_t g_n (B s)(T_t x_n + D_t(x_n)) + noise
 
-Every iteration linearises this in (s, T, g, log a) at once and solves the normal equations by conjugate gradients, with
-a membrane prior on the change of s. Alternating between scene, motion and gains takes many times the iterations,
+Every iteration linearises this in (s, T or D, g, log a) at once and solves the normal equations by conjugate gradients,
+with a membrane prior on the change of s. Alternating between scene, motion and gains takes many times the iterations,
 because each hides the errors of the others. The joint iteration finds rotation and perspective from a coarse shift, and
 tells a core's gain from the scene behind it.
 
@@ -15,26 +15,18 @@ by exp(c p) at the place p looks the same where gains fall by exp(-c x), and exp
 of it. So the exposures have the geometric mean 1, the gains the median 1 and no slope over the field.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from napari_fiberburst.motion.linearised import Linearised, huber
 from napari_fiberburst.motion.models import FrameMotion
-from napari_fiberburst.operators.cg import Blocks, conjugate_gradients
+from napari_fiberburst.motion.problem import COARSE, LEAST_DAMPING, JointProblem, JointState, Level
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.footprint import Footprint
-from napari_fiberburst.operators.grid import Grid, Sampling
-from napari_fiberburst.operators.jacobian import JointJacobian
-from napari_fiberburst.operators.priors import MEMBRANE
+from napari_fiberburst.operators.grid import Sampling
 
-# In medians of the residuals: larger ones count less (Huber, 1964).
-_HUBER = 2.5
-# Variance of the gains about 1 that is expected a priori: bundles measured have 15 to 20 % (1 sigma).
-_GAIN_VARIANCE = 0.04
-# Relative variance by which an iteration may change an exposure: lamps and contact change by some tens of per cent, and
-# the exposures are known to some per cent before the first.
-_EXPOSURE_VARIANCE = 0.01
 # Relative standard deviation of exposures below which they are taken as one.
 _LEAST_FLICKER = 3e-4
 # Relative change of the gains from the middle of the field to its edge that the most even bundle may have.
@@ -43,133 +35,8 @@ _UNEVENNESS = 0.02
 _EXPOSURE_ROUNDS = 8
 # A gain further from 1 than this factor is not believed.
 _LARGEST_GAIN = 50.0
-# Levenberg-Marquardt damping, relative to the diagonal, that is always there.
-_LEAST_DAMPING = 1e-3
-# Of conjugate gradients: iterations at most, and the relative error at which they end. A Gauss-Newton step is only
-# right to first order, so solving it further gains nothing.
-_CG_ITERATIONS, _CG_TOLERANCE = 24, 1e-2
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Level:
-    """One level of the way from coarse to fine; lengths in pitches.
-
-    Attributes
-    ----------
-    spacing : float
-        Between the scene's nodes.
-    smoothness : float
-        Weight of the membrane prior on the change of the scene.
-    iterations : int
-        At most.
-    dof : int
-        Generators that move, at most.
-    damping, decay : float
-        Levenberg-Marquardt damping of the motion, relative, in the first iteration, and its factor from one to the
-        next.
-    """
-
-    spacing: float
-    smoothness: float
-    iterations: int
-    dof: int = 8
-    damping: float = _LEAST_DAMPING
-    decay: float = 1.0
-
-
-# From a coarse shift to within some tenths of a pixel in shift, rotation and scale. The strong damping of the first
-# iterations holds back what is hardly known before the shifts are right.
-COARSE = Level(spacing=0.7, smoothness=3.0, iterations=9, dof=4, damping=0.2, decay=0.6)
-# From there to a tenth of a pixel, shear and perspective too.
-FINER = (
-    Level(spacing=0.7, smoothness=1.0, iterations=6, damping=0.1, decay=0.5),
-    Level(spacing=0.4, smoothness=0.3, iterations=5),
-)
-# And to some hundredths of a pixel, with the samples' own footprint in the model.
-FINE_CORES = (Level(spacing=0.3, smoothness=0.1, iterations=3), Level(spacing=0.22, smoothness=0.03, iterations=2))
-FINE_PIXELS = (Level(spacing=0.25, smoothness=0.1, iterations=2), Level(spacing=0.18, smoothness=0.03, iterations=2))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JointProblem:
-    """What a joint registration is about, which none of its iterations changes.
-
-    Attributes
-    ----------
-    positions : Tensor
-        (N, 2), where the samples are taken, frame pixels.
-    values, weights : Tensor
-        (T, N) intensities, about 1, and how much each counts; 0 leaves a sample out.
-    core_index : Tensor
-        (N,) int64: samples of one core share one gain.
-    cores : int
-        G, how many cores there are.
-    pitch : float
-        Unit of the levels' lengths, pixels.
-    dof : int
-        Degrees of freedom of each frame's motion.
-    gains_fixed : bool
-        Whether the gains stay as they are because the transmission is known.
-    """
-
-    positions: Tensor
-    values: Tensor
-    weights: Tensor
-    core_index: Tensor
-    cores: int
-    pitch: float
-    dof: int
-    gains_fixed: bool = False
-
-    def without(self, frames: Tensor) -> "JointProblem":
-        """Return the problem without the frames that are marked, (T,) bool."""
-        return replace(self, weights=self.weights * (~frames).to(self.weights)[:, None])
-
-    def points(self, motion: FrameMotion) -> Tensor:
-        """Return where the samples lie in the scene, (T, N, 2)."""
-        return motion.apply(self.positions)
-
-    def grid(self, motion: FrameMotion, spacing: float) -> Grid:
-        """Return a grid over all that frames with weight see, its nodes so many pitches apart."""
-        positions = self.positions[(self.weights > 0).any(dim=0)]
-        points = motion.apply(positions)[(self.weights > 0).any(dim=1)]
-        return Grid.around(points, spacing * self.pitch, 2 * self.pitch)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JointState:
-    """Where a joint registration stands.
-
-    Attributes
-    ----------
-    motion : FrameMotion
-        Of the frames.
-    grid : Grid
-        Of the scene.
-    scene : Tensor
-        (H, W) on `grid`.
-    gains : Tensor
-        (G,), one per core.
-    exposures : Tensor
-        (T,), one per frame.
-    footprint : Footprint or None
-        Of the samples, at this level; None for points.
-    residual : float
-        Root of the weighted mean square of what the model leaves, as of the last iteration; NaN before the first.
-    """
-
-    motion: FrameMotion
-    grid: Grid
-    scene: Tensor
-    gains: Tensor
-    exposures: Tensor
-    footprint: Footprint | None = None
-    residual: float = float("nan")
-
-    @property
-    def filtered(self) -> Tensor:
-        """The scene as samples see it, B s."""
-        return self.scene if self.footprint is None else self.footprint(self.scene)
+# In pitches: control points move at most so far in one iteration.
+_LONGEST_STEP = 1.5
 
 
 def start(problem: JointProblem, motion: FrameMotion) -> JointState:
@@ -233,19 +100,40 @@ def iterate(problem: JointProblem, state: JointState, level: Level, number: int)
     JointState, float
         The new state, and the largest displacement of a frame's centre, pixels.
     """
-    damping = max(level.damping * level.decay**number, _LEAST_DAMPING)
-    system = _Linearised.of(problem, state, level.smoothness, min(level.dof, problem.dof), damping)
+    damping = max(level.damping * level.decay**number, LEAST_DAMPING)
+    system = Linearised.of(problem, state, level, damping)
     scene, steps, _, log_exposures = system.solve()
+    if level.bends:
+        motion, farthest = _bent(problem, state.motion, steps)
+    else:
+        motion, farthest = state.motion.moved(steps), state.motion.travel(steps)
     moved = replace(
         state,
-        motion=state.motion.moved(steps),
+        motion=motion,
         scene=state.scene + scene,
         exposures=state.exposures * log_exposures.clamp(-1, 1).exp(),
         residual=float(system.variance**0.5),
     )
     if not problem.gains_fixed:
         moved = _level(problem, _with_best_gains(problem, moved, system.gain_prior))
-    return moved, state.motion.travel(steps)
+    return moved, farthest
+
+
+def _bent(problem: JointProblem, motion: FrameMotion, steps: Tensor) -> tuple[FrameMotion, float]:
+    """Return the motion bent by steps (T, 2, M) of its control points, and how far frames went, pixels.
+
+    The displacements keep the mean 0 over the frames: the scene has the frames' mean shape. With one frame held fixed
+    instead, the scene and all other frames would have to move together, which takes far more iterations.
+    """
+    displacement = motion.displacement
+    assert displacement is not None
+    used = (problem.weights > 0).any(dim=1)
+    longest = steps.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    steps = steps * (_LONGEST_STEP * problem.pitch / longest).clamp(max=1) * used[:, None, None]
+    control = displacement.control + steps
+    control = control - control[used].mean(dim=0) * used[:, None, None]
+    farthest = float(steps.square().sum(dim=1).mean(dim=1).max().sqrt())
+    return replace(motion, displacement=replace(displacement, control=control)), farthest
 
 
 def normalise(problem: JointProblem, state: JointState) -> JointState:
@@ -319,105 +207,6 @@ def scattered_mean(sampling: Sampling, values: Tensor, weights: Tensor, sigma: f
     return (near[0] + faint * filled) / (near[1] + faint)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Linearised:
-    """The normal equations of one iteration, J'WJ + priors, in the changes of scene, motion, gains and exposures."""
-
-    jacobian: JointJacobian
-    weights: Tensor
-    residual: Tensor
-    variance: float
-    gain_change: Tensor  # (G,), how far each gain is from 1
-    gain_prior: float
-    exposure_prior: float
-    gains_fixed: bool
-    smoothness: float
-    damping: Tensor  # (T, k)
-    motion_inverse: Tensor  # (T, k, k)
-
-    @classmethod
-    def of(cls, problem: JointProblem, state: JointState, smoothness: float, dof: int, damping: float) -> "_Linearised":
-        """Linearise at a state."""
-        jacobian = linearise(problem, state, dof)
-        residual = problem.values - jacobian.gains * jacobian.light
-        weights = problem.weights * jacobian.sampling.inside
-        weights = weights * _huber(residual, weights)
-        variance = float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
-        weighted = jacobian.slopes * weights.unsqueeze(-1)
-        blocks = (weighted.mT @ jacobian.slopes).cpu().double()
-        sizes = blocks.diagonal(dim1=1, dim2=2)
-        floor = sizes * damping + sizes.mean() * 1e-6 + 1e-12
-        return cls(
-            jacobian=jacobian,
-            weights=weights,
-            residual=residual,
-            variance=variance,
-            gain_change=state.gains - 1,
-            # With noise of this variance, and gains of theirs about 1, the gains' prior weighs as much as this.
-            gain_prior=max(variance / _GAIN_VARIANCE, 1e-9),
-            exposure_prior=max(variance / _EXPOSURE_VARIANCE, 1e-9),
-            gains_fixed=problem.gains_fixed,
-            smoothness=smoothness,
-            damping=floor.to(weights),
-            motion_inverse=torch.linalg.inv(blocks + torch.diag_embed(floor)).to(weights),
-        )
-
-    def solve(self) -> Blocks:
-        """Return the changes of scene, motion, gains and log exposures."""
-        jacobian, weights = self.jacobian, self.weights
-        scene, motion, gains, exposures = jacobian.adjoint(weights * self.residual)
-        scene_diagonal = jacobian.sampling.normal_diagonal(weights * jacobian.factors**2)
-        scene_inverse = 1 / (scene_diagonal + MEMBRANE.diagonal * self.smoothness)
-        gain_inverse = 1 / (jacobian.per_core(weights * jacobian.light**2) + self.gain_prior)
-        if self.gains_fixed:
-            gain_inverse = torch.zeros_like(gain_inverse)
-        power = (weights * (jacobian.gains * jacobian.light) ** 2).sum(dim=1)
-        exposure_inverse = 1 / (power + self.exposure_prior)
-
-        def precondition(blocks: Blocks) -> Blocks:
-            scene, motion, gains, exposures = blocks
-            moved = (self.motion_inverse @ motion.unsqueeze(-1)).squeeze(-1)
-            return scene * scene_inverse, moved, gains * gain_inverse, exposures * exposure_inverse
-
-        return conjugate_gradients(
-            self._multiply,
-            (scene, motion, gains - self.gain_prior * self.gain_change, exposures),
-            precondition,
-            iterations=_CG_ITERATIONS,
-            tolerance=_CG_TOLERANCE,
-        )
-
-    def _multiply(self, blocks: Blocks) -> Blocks:
-        scene, motion, gains, exposures = blocks
-        to_scene, to_motion, to_gains, to_exposures = self.jacobian.adjoint(self.weights * self.jacobian(blocks))
-        return (
-            to_scene + self.smoothness * MEMBRANE(scene),
-            to_motion + self.damping * motion,
-            to_gains + self.gain_prior * gains,
-            to_exposures + self.exposure_prior * exposures,
-        )
-
-
-def linearise(problem: JointProblem, state: JointState, dof: int) -> JointJacobian:
-    """Return the Jacobian of `predict` in scene, motion, gains and log exposures."""
-    points = problem.points(state.motion)
-    sampling, filtered = state.grid.at(points), state.filtered
-    gains = state.gains[problem.core_index]
-    slope_x, slope_y = sampling.gradient(filtered)
-    along_x, along_y = state.motion.tangent(points, dof)
-    slopes = slope_x.unsqueeze(-1) * along_x + slope_y.unsqueeze(-1) * along_y
-    return JointJacobian(
-        sampling=sampling,
-        footprint=state.footprint,
-        gains=gains,
-        exposures=state.exposures,
-        light=state.exposures[:, None] * sampling(filtered),
-        slopes=slopes * (state.exposures[:, None] * gains).unsqueeze(-1),
-        core_index=problem.core_index,
-        cores=problem.cores,
-    )
-
-
 def _with_best_gains(problem: JointProblem, state: JointState, prior: float) -> JointState:
     """Return the state with the best gains for scene and motion as they are.
 
@@ -426,18 +215,10 @@ def _with_best_gains(problem: JointProblem, state: JointState, prior: float) -> 
     sampling = state.grid.at(problem.points(state.motion))
     light = state.exposures[:, None] * sampling(state.filtered)
     weights = problem.weights * sampling.inside
-    weights = weights * _huber(problem.values - state.gains[problem.core_index] * light, weights)
+    weights = weights * huber(problem.values - state.gains[problem.core_index] * light, weights)
     agreement, power = (
         torch.zeros_like(state.gains).index_add_(0, problem.core_index, part.sum(dim=0))
         for part in (weights * problem.values * light, weights * light**2)
     )
     gains = (agreement + prior) / (power + prior)
     return replace(state, gains=gains.clamp(1 / _LARGEST_GAIN, _LARGEST_GAIN))
-
-
-def _huber(residual: Tensor, weights: Tensor) -> Tensor:
-    """Return the weights of Huber's loss, its threshold set by the median of the residuals that count."""
-    sizes = residual.abs()
-    counted = sizes[weights > 0]
-    threshold = _HUBER * counted.median() if counted.numel() else sizes.new_tensor(1.0)
-    return (threshold / sizes.clamp_min(1e-9)).clamp(max=1)

@@ -13,21 +13,21 @@ from torch import Tensor
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import LEAST_CONFIDENCE, confidence, find_shifts
-from napari_fiberburst.motion.joint import (
+from napari_fiberburst.motion.displacement import ControlGrid, Displacement
+from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
+from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.motion.problem import (
+    BENDING,
     COARSE,
+    CONTROL_SPACING,
     FINE_CORES,
     FINE_PIXELS,
     FINER,
     JointProblem,
     JointState,
     Level,
-    enter,
-    iterate,
-    normalise,
-    predict,
-    start,
 )
-from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.motion.score import bending_score
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
@@ -46,6 +46,9 @@ _LEAST_OF_USUAL = 0.6
 _MOST_SWELLING = 3.0
 # Pixels: iterations at a level end where no frame's centre moves farther than this.
 _ENOUGH = 0.015
+# Frames may bend where their residuals ask for it by at least this score, and do where that leaves at most this part of
+# the residuals.
+_LEAST_BENDING_SCORE, _MOST_LEFT_BY_BENDING = 2.0, 0.9
 # Of full scale: the mean light that values are divided by, at least.
 _LEAST_LIGHT = 1e-4
 
@@ -79,6 +82,8 @@ class Registration(Stored):
     ----------
     scene_from_frame : numpy.ndarray
         (T, 3, 3) float64, frame-t pixel (x, y) to scene pixel.
+    shape : (int, int)
+        Height and width of a frame.
     used : numpy.ndarray
         (T,) bool, frames that take part. The others could not be registered.
     confidence : numpy.ndarray
@@ -103,11 +108,14 @@ class Registration(Stored):
         What a user should know.
     scene : GreyScene or None
         The scene that the frames were registered to.
+    displacement : Displacement or None
+        How frames bend beyond their homographies; None where they were not asked to.
     """
 
     _kind: ClassVar[str] = "registration"
 
     scene_from_frame: NDArray[np.float64]
+    shape: tuple[int, int]
     used: NDArray[np.bool_]
     confidence: NDArray[np.float64]
     frame_weights: NDArray[np.float32]
@@ -119,13 +127,15 @@ class Registration(Stored):
     iterations: int = 0
     notes: tuple[str, ...] = ()
     scene: GreyScene | None = field(default=None, repr=False)
+    displacement: Displacement | None = field(default=None, repr=False)
 
     @classmethod
-    def known(cls, scene_from_frame: NDArray[np.float64], cores: int) -> "Registration":
+    def known(cls, scene_from_frame: NDArray[np.float64], shape: tuple[int, int], cores: int) -> "Registration":
         """Return a registration for motion (T, 3, 3) that is known, such as a simulation's."""
         count = len(scene_from_frame)
         return cls(
             scene_from_frame=np.array(scene_from_frame, dtype=np.float64),
+            shape=shape,
             used=np.ones(count, dtype=bool),
             confidence=np.ones(count),
             frame_weights=np.ones(count, np.float32),
@@ -148,8 +158,16 @@ class Registration(Stored):
 
     def points(self, positions: Tensor) -> Tensor:
         """Return where places (N, 2) of every frame lie in the reference frame's pixels, (T, N, 2); NaN if left out."""
-        points: Tensor = transform_points(torch.from_numpy(self.reference_from_frame).to(positions), positions)
-        return points
+        if self.displacement is None:
+            points: Tensor = transform_points(torch.from_numpy(self.reference_from_frame).to(positions), positions)
+            return points
+        points = self.motion.to_reference(self.motion.apply(positions), self.reference)
+        return torch.where(torch.from_numpy(self.used).to(points.device)[:, None, None], points, torch.nan)
+
+    @property
+    def motion(self) -> FrameMotion:
+        """Frame pixels to scene pixels, as an operator on points."""
+        return FrameMotion(torch.from_numpy(self.scene_from_frame), self.shape, self.displacement)
 
     def correct(self, samples: Samples) -> Samples:
         """Return samples at gains and exposures of 1, and weighed by how far each frame is to be trusted.
@@ -167,12 +185,13 @@ class Registration(Stored):
         """Return the grey light of the scene at pixels (N, 2) of frame `number`, as exposed; 0 where unknown."""
         if self.scene is None or not self.used[number]:
             return torch.zeros(len(pixels)).to(pixels)
-        matrix = torch.from_numpy(self.scene_from_frame[number]).to(pixels)
-        sampling = self.scene.grid.at(transform_points(matrix, pixels))
+        sampling = self.scene.grid.at(self.motion.of_frame(number).apply(pixels)[0])
         return sampling(self.scene.nodes) * (self.scene.light * float(self.exposures[number]))
 
 
-def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, seed: int = 0) -> Registration:
+def register(
+    samples: Samples, *, dof: int = 8, bends: bool | None = None, iterations: int | None = None, seed: int = 0
+) -> Registration:
     """Find how every frame lies on the scene.
 
     Parameters
@@ -182,6 +201,8 @@ def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, s
     dof : int
         Degrees of freedom of each frame's motion: 2 for a translation, 4 for a similarity, 6 for an affine transform, 8
         for a homography; 0 where the frames are known not to move.
+    bends : bool, optional
+        Whether frames bend beyond that; None lets the residuals tell.
     iterations : int, optional
         Gauss-Newton iterations at most.
     seed : int
@@ -192,7 +213,7 @@ def register(samples: Samples, *, dof: int = 8, iterations: int | None = None, s
     Registration
         Frames that do not belong are marked in `used`, and named in `notes`.
     """
-    return drain(registering(samples, dof=dof, iterations=iterations, seed=seed))
+    return drain(registering(samples, dof=dof, bends=bends, iterations=iterations, seed=seed))
 
 
 def refine(
@@ -224,6 +245,7 @@ def unregistered(samples: Samples) -> Registration:
     count = len(samples.values)
     return Registration(
         scene_from_frame=np.tile(np.eye(3), (count, 1, 1)),
+        shape=samples.shape,
         used=np.ones(count, dtype=bool),
         confidence=np.full(count, np.nan),
         frame_weights=np.ones(count, np.float32),
@@ -233,7 +255,7 @@ def unregistered(samples: Samples) -> Registration:
 
 
 def registering(
-    samples: Samples, *, dof: int, iterations: int | None, seed: int
+    samples: Samples, *, dof: int, bends: bool | None, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
     """Register as `register` does; yields what is known after each iteration."""
     start = unregistered(samples)
@@ -261,6 +283,9 @@ def registering(
     found = replace(found, stage="fine")
     yield found
     found = yield from search.refine(found, FINER, None, None)
+    if bends or (bends is None and search.asks_to_bend(found)):
+        bent = yield from search.refine(_bendable(found, samples), BENDING, None, None)
+        found = bent if bends or bent.residual < _MOST_LEFT_BY_BENDING * found.residual else found
     found = _judged(found, samples)
     if found.used.sum() < 2:
         return _alone(found, samples)
@@ -307,9 +332,9 @@ class _Search:
         """Refine by at most so many samples, seen through a footprint of this radius; yields after each iteration."""
         light = _light(self.samples, found) if found.scene is None else found.scene.light
         problem = self._problem(found, light, most)
-        motion = FrameMotion(torch.from_numpy(found.scene_from_frame), self.samples.shape)
-        state = start(problem, motion) if found.scene is None else self._resumed(found, found.scene, problem)
+        state = start(problem, found.motion) if found.scene is None else self._resumed(found, found.scene, problem)
         for level in levels:
+            level = replace(level, bends=found.displacement is not None)
             if self._is_spent(found):
                 break
             state = enter(problem, state, level, radius)
@@ -331,15 +356,22 @@ class _Search:
         return replace(self._registered(found, problem, state, light), frame_weights=weights)
 
     def _resumed(self, found: Registration, scene: GreyScene, problem: JointProblem) -> JointState:
-        """Return the state where an earlier search has left off, all gains 1."""
-        gains = torch.ones(problem.cores, dtype=scene.nodes.dtype, device=scene.nodes.device)
+        """Return the state where an earlier search has left off."""
+        gains = torch.from_numpy(found.gains).to(scene.nodes)
         return JointState(
-            motion=FrameMotion(torch.from_numpy(found.scene_from_frame), self.samples.shape),
+            motion=found.motion,
             grid=scene.grid,
             scene=scene.nodes,
             gains=gains,
             exposures=torch.from_numpy(found.exposures).to(gains),
         )
+
+    def asks_to_bend(self, found: Registration) -> bool:
+        """Whether what is left of rigid frames has the structure that displacements leave."""
+        if found.scene is None or self._is_spent(found):
+            return False
+        problem = self._problem(found, found.scene.light, None)
+        return bending_score(problem, self._resumed(found, found.scene, problem)) > _LEAST_BENDING_SCORE
 
     def _is_spent(self, found: Registration) -> bool:
         return self.iterations is not None and found.iterations >= self.iterations
@@ -361,6 +393,7 @@ class _Search:
             pitch=samples.pitch,
             dof=self.dof,
             gains_fixed=samples.gains_known,
+            controls=None if found.displacement is None else found.displacement.grid.at(samples.positions[chosen]),
         )
 
     def _registered(self, found: Registration, problem: JointProblem, state: JointState, light: float) -> Registration:
@@ -369,11 +402,18 @@ class _Search:
         return replace(
             found,
             scene_from_frame=state.motion.scene_from_frame.numpy().copy(),
+            displacement=state.motion.displacement,
             gains=state.gains.cpu().numpy() if is_every_core_asked else found.gains,
             exposures=state.exposures.cpu().numpy(),
             residual=state.residual * light,
             scene=GreyScene(grid=state.grid, nodes=state.scene, light=light),
         )
+
+
+def _bendable(found: Registration, samples: Samples) -> Registration:
+    """Return the registration with frames that may bend, and do not yet."""
+    grid = ControlGrid.over(samples.shape, CONTROL_SPACING * samples.pitch)
+    return replace(found, displacement=Displacement.none(len(found.used), grid, samples.positions.device))
 
 
 def _light(samples: Samples, found: Registration) -> float:
@@ -395,10 +435,9 @@ def _frame_weights(problem: JointProblem, state: JointState, used: NDArray[np.bo
 def _judged(found: Registration, samples: Samples) -> Registration:
     """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
     samples = samples.weighted(torch.from_numpy(found.used))
-    motion = FrameMotion(torch.from_numpy(found.scene_from_frame), samples.shape)
     gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
     values = samples.grey / (exposures[:, None] * gains[samples.core_index])
-    agreement = confidence(samples.positions, values, samples.weights, motion, samples.pitch)
+    agreement = confidence(samples.positions, values, samples.weights, found.motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
     used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))
     judged = replace(found, used=used, confidence=trust, frame_weights=used.astype(np.float32))

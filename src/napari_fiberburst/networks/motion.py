@@ -191,7 +191,11 @@ class FlowField(MotionField):
 
 
 def make_motion(
-    choice: settings.Motion, frames: int, shape: tuple[int, int], generator: Generator, start: Tensor | None = None
+    choice: settings.NetworkMotion | settings.PublishedMotion,
+    frames: int,
+    shape: tuple[int, int],
+    generator: Generator,
+    start: Tensor | None = None,
 ) -> MotionField:
     """Build the motion field that the settings ask for.
 

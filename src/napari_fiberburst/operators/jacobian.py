@@ -1,6 +1,7 @@
 """The derivative of what samples see, in all that is unknown about it at once."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -10,12 +11,71 @@ from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Sampling
 
 
+class Operator(Protocol):
+    """A linear operator and its adjoint."""
+
+    def __call__(self, values: Tensor, /) -> Tensor:
+        """Return A x."""
+        ...
+
+    def adjoint(self, values: Tensor, /) -> Tensor:
+        """Return A' y."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GeneratorSlopes:
+    """How samples (T, N) change as frames move along the generators of their model, (T, k).
+
+    Attributes
+    ----------
+    slopes : Tensor
+        (T, N, k).
+    """
+
+    slopes: Tensor
+
+    def __call__(self, steps: Tensor) -> Tensor:
+        """Return how the samples change by steps (T, k)."""
+        return (self.slopes @ steps.unsqueeze(-1)).squeeze(-1)
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return the adjoint of values (T, N): (T, k)."""
+        return (self.slopes.mT @ values.unsqueeze(-1)).squeeze(-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlSlopes:
+    """How samples (T, N) change as the control points of each frame's displacement move, (T, 2, M).
+
+    Attributes
+    ----------
+    along_x, along_y : Tensor
+        (T, N), slopes of the samples in the scene.
+    weights : Operator
+        From control points (..., M) to samples (..., N), the same for all frames.
+    """
+
+    along_x: Tensor
+    along_y: Tensor
+    weights: Operator
+
+    def __call__(self, steps: Tensor) -> Tensor:
+        """Return how the samples change by steps (T, 2, M)."""
+        x, y = self.weights(steps).unbind(dim=1)
+        return self.along_x * x + self.along_y * y
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return the adjoint of values (T, N): (T, 2, M)."""
+        return self.weights.adjoint(torch.stack([values * self.along_x, values * self.along_y], dim=1))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointJacobian:
     """The Jacobian of v_tn = a_t g_n (B s)(T_t x_n) in scene s, motion T, gains g and exposures a.
 
-    Blocks are the changes of the scene (H, W), of the motion (T, k) along the generators of its model, of the gains
-    (G,), and of the logarithms of the exposures (T,); samples are (T, N).
+    Blocks are the changes of the scene (H, W), of the motion as `motion` takes it, of the gains (G,), and of the
+    logarithms of the exposures (T,); samples are (T, N).
 
     Attributes
     ----------
@@ -29,8 +89,8 @@ class JointJacobian:
         (T,) a_t.
     light : Tensor
         (T, N), a_t (B s)(T_t x_n).
-    slopes : Tensor
-        (T, N, k), a_t g_n times the slope of B s along each generator.
+    motion : GeneratorSlopes or ControlSlopes
+        Of a_t g_n B s.
     core_index : Tensor
         (N,) int64, which of the gains each sample has.
     cores : int
@@ -42,7 +102,7 @@ class JointJacobian:
     gains: Tensor
     exposures: Tensor
     light: Tensor
-    slopes: Tensor
+    motion: GeneratorSlopes | ControlSlopes
     core_index: Tensor
     cores: int
 
@@ -50,16 +110,15 @@ class JointJacobian:
         """Return how the samples change."""
         scene, motion, gains, exposures = blocks
         filtered = scene if self.footprint is None else self.footprint(scene)
-        change = self.factors * self.sampling(filtered) + (self.slopes @ motion.unsqueeze(-1)).squeeze(-1)
+        change = self.factors * self.sampling(filtered) + self.motion(motion)
         return change + self.light * (gains[self.core_index] + self.gains * exposures[:, None])
 
     def adjoint(self, values: Tensor) -> Blocks:
         """Return the adjoint's scene, motion, gains and exposures."""
         scene = self.sampling.adjoint(values * self.factors)
         scene = scene if self.footprint is None else self.footprint.adjoint(scene)
-        motion = (self.slopes.mT @ values.unsqueeze(-1)).squeeze(-1)
         through = values * self.light
-        return scene, motion, self.per_core(through), through @ self.gains
+        return scene, self.motion.adjoint(values), self.per_core(through), through @ self.gains
 
     @property
     def factors(self) -> Tensor:

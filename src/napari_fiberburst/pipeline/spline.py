@@ -12,7 +12,7 @@ from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.stages import Fitted, Stages
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
-from napari_fiberburst.settings import Settings, SplineMethod
+from napari_fiberburst.settings import AutoMotion, Deformable, Homography, Settings, SplineMethod
 
 # Rounds and stages that a fit has, about: what is left is counted in these.
 _PLANNED = 27
@@ -137,6 +137,9 @@ class SplineFit:
         # The smoothness of a draft is a usual one, which may be chosen yet.
         if fitted.scene is not None and (is_last or not fitted.scene.is_draft):
             method = replace(method, smoothness=fitted.scene.smoothness)
+        if is_last and isinstance(method.motion, AutoMotion):
+            bends = fitted.registration.displacement is not None
+            method = replace(method, motion=Deformable() if bends else Homography())
         if is_last:
             method = replace(method, iterations=fitted.registration.iterations or method.iterations or 1)
         return replace(self._requested, method=method, device=str(self._device))

@@ -180,6 +180,7 @@ class Stages:
         steps = registering(
             samples,
             dof=self._method.motion.dof,
+            bends=self._method.motion.bends,
             iterations=self._method.iterations,
             seed=self._seed,
         )
@@ -336,6 +337,7 @@ def image_of(
         reach=bundle.pitch,
         fill=fill,
         homographies=registration.reference_from_frame,
+        motion=None if registration.displacement is None else registration.motion.cpu(),
         black=(bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level),
     )
 

@@ -10,6 +10,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates, spline_filter
 from torch import Tensor
 
 from napari_fiberburst.coordinates import transform_points
+from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators.grid import Grid
 
 # What the spline takes the scene for beyond its nodes; nothing is drawn there.
@@ -35,6 +36,8 @@ class SplineImage:
         (T, 3, 3), frame-t pixel to the reference frame's.
     black : float
         Intensity of no light.
+    motion : FrameMotion, optional
+        Where frames bend: into the scene that they were registered to.
     """
 
     def __init__(
@@ -47,10 +50,11 @@ class SplineImage:
         fill: bool,
         homographies: NDArray[np.float64],
         black: float,
+        motion: FrameMotion | None = None,
     ) -> None:
         self.scene, self.grid = scene, grid
         self._known, self._reach, self._fill = known, reach, fill
-        self.homographies, self.black = homographies, black
+        self.homographies, self.black, self._motion = homographies, black, motion
         self._far: Tensor | None = None
 
     @property
@@ -103,6 +107,7 @@ class SplineImage:
             "nodes": np.array([self.grid.x0, self.grid.y0, self.grid.spacing]),
             "drawing": np.array([self._reach, float(self._fill), self.black]),
             "homographies": self.homographies,
+            **({} if self._motion is None else self._motion.arrays()),
         }
 
     @classmethod
@@ -119,10 +124,17 @@ class SplineImage:
             fill=bool(fill),
             homographies=arrays["homographies"],
             black=black,
+            motion=FrameMotion.from_arrays(arrays),
         )
 
     def _mapped(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        return transform_points(self.homographies[frame], points)
+        if self._motion is None:
+            return transform_points(self.homographies[frame], points)
+        if frame == self.reference:
+            return points
+        places = self._motion.of_frame(frame).apply(torch.from_numpy(points.reshape(-1, 2)))[0]
+        mapped: NDArray[np.float64] = self._motion.to_reference(places, self.reference).numpy().reshape(points.shape)
+        return mapped
 
     def _distance(self) -> Tensor:
         """Return how far each node is from what is known, pixels (H, W)."""

@@ -85,6 +85,7 @@ class NoMotion:
 
     name: ClassVar[str] = "none"
     dof: ClassVar[int] = 0
+    bends: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,6 +94,7 @@ class Translation:
 
     name: ClassVar[str] = "translation"
     dof: ClassVar[int] = 2
+    bends: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +103,7 @@ class Similarity:
 
     name: ClassVar[str] = "similarity"
     dof: ClassVar[int] = 4
+    bends: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +112,7 @@ class Affine:
 
     name: ClassVar[str] = "affine"
     dof: ClassVar[int] = 6
+    bends: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,6 +121,25 @@ class Homography:
 
     name: ClassVar[str] = "homography"
     dof: ClassVar[int] = 8
+    bends: ClassVar[bool] = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Deformable:
+    """One homography per frame, and a smooth displacement beyond it: tissue that bends."""
+
+    name: ClassVar[str] = "deformable"
+    dof: ClassVar[int] = 8
+    bends: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutoMotion:
+    """Homography or deformable, as samples that are left out approve."""
+
+    name: ClassVar[str] = "auto"
+    dof: ClassVar[int] = 8
+    bends: ClassVar[None] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,11 +181,14 @@ class FlowTV(Flow):
 Encoding = NoEncoding | NeRF | Fourier | Hash | Siren
 # Behind a bundle model every frame has a transform of its own; as published, a network of time gives them all.
 FrameMotion = NoMotion | Translation | Similarity | Affine | Homography
+NetworkMotion = FrameMotion | Flow | FlowTV
+SplineMotion = AutoMotion | FrameMotion | Deformable
 PublishedMotion = NoMotion | HomographyNetwork | Flow | FlowTV
-Motion = FrameMotion | Flow | FlowTV | HomographyNetwork
+Motion = SplineMotion | Flow | FlowTV | HomographyNetwork
 
 ENCODINGS: Mapping[str, type[Encoding]] = {choice.name: choice for choice in get_args(Encoding)}
 MOTIONS: Mapping[str, type[Motion]] = {
     choice.name: choice for choice in get_args(Motion) if choice is not HomographyNetwork
 }
+NETWORK_MOTIONS: Mapping[str, type[Motion]] = {choice.name: choice for choice in get_args(NetworkMotion)}
 PUBLISHED_MOTIONS: Mapping[str, type[Motion]] = {choice.name: choice for choice in get_args(PublishedMotion)}

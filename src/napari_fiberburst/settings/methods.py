@@ -8,16 +8,18 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.settings.choices import (
     ENCODINGS,
     MOTIONS,
+    NETWORK_MOTIONS,
     PUBLISHED_MOTIONS,
+    AutoMotion,
     Encoding,
     Flow,
-    FlowTV,
     Fourier,
-    FrameMotion,
     Homography,
     HomographyNetwork,
     Motion,
+    NetworkMotion,
     PublishedMotion,
+    SplineMotion,
 )
 from napari_fiberburst.settings.parameter import check, parameter
 
@@ -74,7 +76,7 @@ class SplineMethod(_BehindBundle):
 
     Attributes
     ----------
-    motion : FrameMotion
+    motion : SplineMotion
         How the object moves between frames.
 
     Notes
@@ -84,7 +86,7 @@ class SplineMethod(_BehindBundle):
 
     name: ClassVar[str] = "spline"
     motions: ClassVar[Mapping[str, type[Motion]]] = MOTIONS
-    motion: FrameMotion = field(default_factory=Homography)
+    motion: SplineMotion = field(default_factory=AutoMotion)
     smoothness: float | None = parameter(
         None,
         "Weight of the smoothness prior; more is smoother and less noisy. None lets two halves of the burst choose.",
@@ -108,7 +110,7 @@ class NetworkMethod(_BehindBundle, _SceneNetwork):
 
     Attributes
     ----------
-    motion : Motion
+    motion : NetworkMotion
         How the object moves between frames.
     encoding : Encoding
         How coordinates are presented to the network.
@@ -119,8 +121,8 @@ class NetworkMethod(_BehindBundle, _SceneNetwork):
     """
 
     name: ClassVar[str] = "network"
-    motions: ClassVar[Mapping[str, type[Motion]]] = MOTIONS
-    motion: FrameMotion | Flow | FlowTV = field(default_factory=Homography)
+    motions: ClassVar[Mapping[str, type[Motion]]] = NETWORK_MOTIONS
+    motion: NetworkMotion = field(default_factory=Homography)
     encoding: Encoding = field(default_factory=Fourier)
     iterations: int | None = parameter(None, _STEPS, least=1)
     learning_rate: float | None = parameter(None, _RATE, above=0, most=1e6)

@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, PUBLISHED_MOTIONS
+from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, PUBLISHED_MOTIONS, AutoMotion
 from napari_fiberburst.settings.keywords import ENCODING_NAMES, keywords_of
 from napari_fiberburst.settings.methods import METHODS, Method, NetworkMethod, PublishedMethod, SplineMethod
 from napari_fiberburst.settings.parameter import Parameter, parameters_of
@@ -42,6 +42,8 @@ def choose(preset: str | Settings = "auto", **choices: Any) -> Settings:
             known[name].check(given[name])
     observation, encoding = given.pop("observation", settings.flat()["observation"]), given.pop("encoding", None)
     kind = _kind_of(settings.method, observation, encoding)
+    if kind is not SplineMethod and given.get("motion") == AutoMotion.name:
+        del given["motion"]  # networks have one usual motion
     values = _carried(settings.method, kind)
     values["motion"] = _turned(_part("motion", given.pop("motion", None), values["motion"], kind.motions), given)
     if "encoding" in values:
@@ -90,8 +92,9 @@ def _carried(method: Method, kind: type[Method]) -> dict[str, Any]:
     usual = kind()
     values = {item.name: getattr(usual, item.name) for item in fields(kind)}
     values |= {name: kept for name in values if (kept := getattr(method, name, None)) is not None}
-    if kind.motions is not method.motions:  # the other family of motions: its namesake
-        values["motion"] = kind.motions.get(method.motion.name, type(usual.motion))()
+    if kind.motions is not method.motions:  # another family of motions: what is usual in it, or the namesake
+        is_usual = type(method.motion) is type(type(method)().motion)
+        values["motion"] = usual.motion if is_usual else kind.motions.get(method.motion.name, type(usual.motion))()
     return values
 
 

@@ -1,0 +1,145 @@
+"""How frames bend beyond their homographies: smooth displacements on a grid of control points.
+
+A displacement is a uniform cubic B-spline over the frame, which is smooth in its slopes (Rueckert et al., "Nonrigid
+registration using free-form deformations", IEEE Transactions on Medical Imaging 18(8), 1999).
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class ControlGrid:
+    """Control points over a frame, and one row or column beyond what its splines reach.
+
+    Attributes
+    ----------
+    spacing : float
+        Pixels from one control point to the next; the first but one lies on pixel (0, 0).
+    shape : (int, int)
+        Rows and columns of control points.
+    """
+
+    spacing: float
+    shape: tuple[int, int]
+
+    @classmethod
+    def over(cls, shape: tuple[int, int], spacing: float) -> "ControlGrid":
+        """Cover a frame (height, width)."""
+        rows, columns = (math.floor(max(1, side - 1) / spacing) + 4 for side in shape)
+        return cls(spacing, (rows, columns))
+
+    def splines(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which control points frame points (N, 2) depend on, and by what weights: (N, 16) each.
+
+        Beyond the frame, what its edge has goes on.
+        """
+        rows, columns = self.shape
+        limits = torch.tensor([columns - 2, rows - 2]).to(points)
+        place = torch.minimum((points / self.spacing + 1).clamp_min(1), limits - 1e-4)
+        first = place.floor()
+        along_x, along_y = (_cubic(part) for part in (place - first).unbind(dim=-1))
+        steps = torch.arange(-1, 3, device=points.device)
+        column, row = (part.long()[:, None] + steps for part in first.unbind(dim=-1))
+        index = row[:, :, None] * columns + column[:, None, :]
+        return index.flatten(1), (along_y[:, :, None] * along_x[:, None, :]).flatten(1)
+
+    def at(self, points: Tensor) -> "ControlWeights":
+        """Return the operator from values at control points to values at frame points (N, 2)."""
+        index, weight = self.splines(points)
+        number = torch.arange(len(points), device=points.device)[:, None].expand_as(index)
+        entries = torch.stack([number.flatten(), index.flatten()])
+        size = (len(points), self.shape[0] * self.shape[1])
+        matrix = torch.sparse_coo_tensor(entries, weight.flatten(), size, check_invariants=False).coalesce()
+        return ControlWeights(matrix, matrix.t().coalesce())
+
+
+def _cubic(offset: Tensor) -> Tensor:
+    """Return the four cubic B-splines at offsets (N,) in [0, 1) from the second of their knots, (N, 4)."""
+    rest = 1 - offset
+    splines = [
+        rest**3,
+        3 * offset**3 - 6 * offset**2 + 4,
+        3 * rest**3 - 6 * rest**2 + 4,
+        offset**3,
+    ]
+    return torch.stack(splines, dim=-1) / 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlWeights:
+    """Interpolation from M control points to N places, and its adjoint.
+
+    Attributes
+    ----------
+    matrix : Tensor
+        (N, M), sparse.
+    transposed : Tensor
+        (M, N), sparse.
+    """
+
+    matrix: Tensor
+    transposed: Tensor
+
+    def __call__(self, control: Tensor) -> Tensor:
+        """Return values (..., M) of control points at the places, (..., N)."""
+        found: Tensor = torch.sparse.mm(self.matrix, control.reshape(-1, control.shape[-1]).T)
+        return found.T.reshape(*control.shape[:-1], -1)
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return what values (..., N) at the places add to the control points, (..., M)."""
+        found: Tensor = torch.sparse.mm(self.transposed, values.reshape(-1, values.shape[-1]).T)
+        return found.T.reshape(*values.shape[:-1], -1)
+
+    def normal_diagonal(self, weights: Tensor) -> Tensor:
+        """Return the diagonal of S' W S for weights (..., N): (..., M)."""
+        squared = torch.sparse_coo_tensor(
+            self.transposed.indices(),
+            self.transposed.values() ** 2,
+            self.transposed.shape,
+            is_coalesced=True,
+            check_invariants=False,
+        )
+        found: Tensor = torch.sparse.mm(squared, weights.reshape(-1, weights.shape[-1]).T)
+        return found.T.reshape(*weights.shape[:-1], -1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Displacement:
+    """How every frame bends: what is added to the places that its homography gives, scene pixels.
+
+    Attributes
+    ----------
+    grid : ControlGrid
+        Over the frame.
+    control : Tensor
+        (T, 2, M), of the control points along x and y.
+    """
+
+    grid: ControlGrid
+    control: Tensor
+
+    @classmethod
+    def none(cls, count: int, grid: ControlGrid, device: torch.device) -> "Displacement":
+        """Return the displacement of so many frames that do not bend."""
+        return cls(grid, torch.zeros(count, 2, grid.shape[0] * grid.shape[1], device=device))
+
+    def at(self, points: Tensor) -> Tensor:
+        """Return the displacement of every frame at points (N, 2), (T, N, 2)."""
+        index, weight = self.grid.splines(points)
+        parts = [(frame.to(weight)[:, index] * weight).sum(dim=-1).T for frame in self.control]
+        return torch.stack(parts)
+
+    def of_frame(self, number: int) -> "Displacement":
+        """Return the displacement of one frame alone."""
+        return Displacement(self.grid, self.control[number : number + 1])
+
+    def size(self, shape: tuple[int, int]) -> Tensor:
+        """Return the root mean square over each frame (height, width), pixels (T,)."""
+        rows, columns = (torch.linspace(0, side - 1, 32) for side in shape)
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        points = torch.stack([x, y], dim=-1).reshape(-1, 2).to(self.control)
+        return self.at(points).square().sum(dim=2).mean(dim=1).sqrt()

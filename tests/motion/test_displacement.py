@@ -1,0 +1,59 @@
+"""Displacements are cubic splines over the frame, and can be inverted."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import BSpline
+
+from napari_fiberburst.motion.displacement import ControlGrid, Displacement
+from napari_fiberburst.motion.models import FrameMotion
+
+SHAPE = (61, 83)
+
+
+def bent(size, generator=None):
+    grid = ControlGrid.over(SHAPE, 17.0)
+    generator = torch.Generator().manual_seed(3) if generator is None else generator
+    return Displacement(grid, size * torch.randn(3, 2, grid.shape[0] * grid.shape[1], generator=generator))
+
+
+def test_control_points_cover_the_frame_and_a_row_beyond():
+    grid = ControlGrid.over(SHAPE, 17.0)
+    assert grid.shape == (3 + 4, 4 + 4)
+    index, weight = grid.splines(torch.tensor([[0.0, 0.0], [82.0, 60.0], [500.0, -9.0]]))
+    assert int(index.min()) >= 0
+    assert int(index.max()) < 56
+    torch.testing.assert_close(weight.sum(dim=1), torch.ones(3))
+
+
+def test_a_displacement_is_scipys_spline():
+    displacement = bent(2.0)
+    rows, columns = displacement.grid.shape
+    control = displacement.control[1, 0].reshape(rows, columns).numpy()
+    x = np.linspace(0, 82, 40)
+    knots = (np.arange(columns + 4) - 3.0) * 17.0
+    along_y = BSpline((np.arange(rows + 4) - 3.0) * 17.0, control, 3)(23.5)
+    expected = BSpline(knots, along_y, 3)(x)
+    points = torch.from_numpy(np.stack([x, np.full_like(x, 23.5)], axis=1)).float()
+    np.testing.assert_allclose(displacement.at(points)[1, :, 0].numpy(), expected, atol=1e-4)
+    weights = displacement.grid.at(points)
+    torch.testing.assert_close(weights(displacement.control).mT, displacement.at(points), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("reference", [0, 2])
+def test_the_reference_frame_is_where_it_was(reference):
+    matrices = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)
+    matrices[:, :2, 2] = torch.tensor([[0.0, 0], [4, -3], [-7, 2]])
+    motion = FrameMotion(matrices, SHAPE, bent(1.5))
+    y, x = torch.meshgrid(torch.arange(4.0, 58, 9), torch.arange(5.0, 80, 9), indexing="ij")
+    points = torch.stack([x, y], dim=-1).reshape(-1, 2)
+    places = motion.apply(points)
+    torch.testing.assert_close(motion.to_reference(places, reference)[reference], points, atol=0.01, rtol=0)
+    assert float((motion.to_reference(places, reference)[1 - reference // 2] - points).abs().max()) > 1
+
+
+def test_a_displacement_has_a_size():
+    grid = ControlGrid.over(SHAPE, 17.0)
+    even = torch.zeros(2, 2, grid.shape[0] * grid.shape[1])
+    even[1, 0], even[1, 1] = 3.0, -4.0
+    torch.testing.assert_close(Displacement(grid, even).size(SHAPE), torch.tensor([0.0, 5.0]))
