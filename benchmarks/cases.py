@@ -11,10 +11,8 @@ from typing import Any
 
 import numpy as np
 import skimage.data
-from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from napari_fiberburst import Burst
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.simulation import Camera, Scene, SimulatedBurst, brownian_motion, simulate
 
@@ -64,7 +62,7 @@ class Case:
     motion: str = "brownian"
     seed: int = 0
     photons: float = 10_000.0
-    bundle: Mapping[str, float] = field(default_factory=dict)
+    bundle: Mapping[str, Any] = field(default_factory=dict)
     magnify: float = 1.0
     order: str = "as recorded"
     keep: int | None = None
@@ -126,24 +124,7 @@ def _make(case: Case) -> SimulatedBurst:
         chosen[1:] = np.random.default_rng(case.seed).permutation(chosen[1:])
     if case.keep is not None:
         chosen = np.array([0, 0]) if case.keep == 1 else chosen[: case.keep]
-    if np.array_equal(chosen, np.arange(case.frames)):
-        return whole
-    recorded: NDArray[Any] = whole.arrays()["frames"][chosen]
-    grey = recorded.shape[3] == 1
-    burst = Burst(
-        recorded[..., 0] if grey else recorded,
-        axes="TYX" if grey else "TYXC",
-        black_level=0,
-        white_level=whole.burst.white_level,
-    )
-    return SimulatedBurst(
-        burst=burst,
-        truth=whole.truth[chosen],
-        homographies=whole.homographies[chosen],
-        transmission=whole.transmission,
-        bundle=whole.bundle,
-        scene=whole.scene,
-    )
+    return whole.take(chosen)
 
 
 def comparison(*, is_quick: bool = False, is_large: bool = False) -> tuple[Case, ...]:
