@@ -331,6 +331,7 @@ def test_faults_out_of_range_are_refused(faults, said):
         ({"flat": np.zeros((40, 50))}, "flat must hold finite intensities"),
         ({"flat": np.full((40, 50), np.nan)}, "flat must hold finite intensities"),
         ({"flat": np.ones((40, 50))}, "flat must show the cores"),
+        ({"flat": np.ones((40, 50)), "crosstalk": 1.5}, "crosstalk must be from 0 to 1"),
         ({"flat": np.ones((40, 50)), "pitch": 5.0}, "unknown setting 'pitch'; known of a bundle given by its flat"),
     ],
 )

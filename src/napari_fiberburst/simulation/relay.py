@@ -203,8 +203,10 @@ def find_bundle(flat: NDArray[np.float64], crosstalk: float) -> Bundle:
     Raises
     ------
     SettingsError
-        No cores are seen.
+        No cores are seen, or `crosstalk` is not in [0, 1].
     """
+    if not 0 <= crosstalk <= 1:
+        raise SettingsError(f"crosstalk must be from 0 to 1; got {crosstalk!r}")
     grey = flat.mean(axis=2)
     pitch = _pitch(grey)
     smooth = gaussian_filter(grey, 0.18 * pitch)

@@ -313,8 +313,7 @@ def _as_burst(recorded: NDArray[Any], white_level: float) -> Burst:
 
 def _designed(bundle: Bundle, shape: tuple[int, int], contrast: float | None) -> RelayAt:
     """Return the relay of a bundle that was laid out."""
-    flat = bundle.transmission(shape)[..., None]
-    fading = None if contrast is None else Fading.to(contrast, flat, bundle)
+    fading = None if contrast is None else Fading.to(contrast, bundle.transmission(shape)[..., None], bundle)
     return lambda offset: relay_of_design(replace(bundle, centres=bundle.centres + offset), shape, fading)
 
 
