@@ -31,7 +31,7 @@ lint: .venv/dev
 	$(BIN)/mypy
 	$(BIN)/npe2 validate src/napari_fiberburst/napari.yaml
 
-# Every table and figure of the documentation: some 80 minutes on two cores. BURST=FOLDER adds the real burst's table;
+# Every table and figure of the documentation: some 90 minutes on two cores. BURST=FOLDER adds the real burst's table;
 # MORE passes anything else on: make bench MORE=--resume
 bench: .venv/bench .venv-peers/made
 	$(BIN)/python -m benchmarks $(if $(BURST),--burst $(BURST)) $(MORE)

@@ -1,6 +1,6 @@
 """Run the benchmark: every method on the same bursts, its tables and figures into a results folder.
 
-`make bench` runs all of it, in some 80 minutes on two cores; `make bench-quick` a small part, in under 3 minutes.
+`make bench` runs all of it, in some 90 minutes on two cores; `make bench-quick` a small part, in under 3 minutes.
 A killed run goes on with --resume. Nothing is measured twice.
 """
 
@@ -15,6 +15,7 @@ from benchmarks.compare import SLOW, compare
 from benchmarks.costs import measure_costs
 from benchmarks.methods import Effort
 from benchmarks.real import RealBurst, measure_real
+from benchmarks.recorded import measure_recorded
 from benchmarks.results import TABLES, Recorder
 from napari_fiberburst.errors import FiberBurstError
 
@@ -69,8 +70,10 @@ def run(
         elif number == 4:
             assert real is not None
             measure_real(recorder, real, chosen)
-        else:
+        elif number == 5:
             measure_costs(recorder, device=options.device, is_quick=options.quick)
+        else:
+            measure_recorded(recorder, cases.recorded(is_quick=options.quick), chosen, effort)
 
 
 def parse() -> argparse.Namespace:

@@ -11,13 +11,25 @@ from typing import Any
 
 import numpy as np
 import skimage.data
-from numpy.typing import NDArray
 from scipy.ndimage import zoom
 
-from napari_fiberburst import Burst
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.simulation import Camera, Scene, SimulatedBurst, brownian_motion, simulate
+from napari_fiberburst.simulation import Camera, Faults, Scene, SimulatedBurst, brownian_motion, simulate
 
+# All faults together, each about as strong as in a recording made with care.
+_MILD: Mapping[str, Any] = {
+    "flicker": 0.03,
+    "deformation": 1.0,
+    "smear": 0.3,
+    "background": 0.2,
+    "vignette": 2.0,
+    "field": 0.95,
+    "overlay": True,
+    "intruder": 0.02,
+    "black_frames": 1,
+    "white_frames": 1,
+    "bundle_shift": 0.5,
+}
 # The published encoding's spread, cycles per half frame, and the cores across the bundle that it was chosen for.
 PUBLISHED_SIGMA, PUBLISHED_CORES_ACROSS = 5.0, 188.0
 
@@ -46,6 +58,8 @@ class Case:
         Electrons at full scale; fewer are noisier.
     bundle : mapping
         Further settings of the bundle.
+    faults : mapping
+        Settings of `napari_fiberburst.simulation.Faults`: what is wrong with the recording.
     magnify : float
         Photographs are enlarged so much before anything is seen of them.
     order : str
@@ -64,7 +78,8 @@ class Case:
     motion: str = "brownian"
     seed: int = 0
     photons: float = 10_000.0
-    bundle: Mapping[str, float] = field(default_factory=dict)
+    bundle: Mapping[str, Any] = field(default_factory=dict)
+    faults: Mapping[str, Any] = field(default_factory=dict)
     magnify: float = 1.0
     order: str = "as recorded"
     keep: int | None = None
@@ -96,6 +111,7 @@ class Case:
             motion=turning if self.motion == "turning" else self.motion,
             physics=self.physics,
             camera=Camera(photons=self.photons),
+            faults=Faults(**self.faults),
             seed=self.seed,
             pitch=self.pitch,
             **self.bundle,
@@ -126,24 +142,7 @@ def _make(case: Case) -> SimulatedBurst:
         chosen[1:] = np.random.default_rng(case.seed).permutation(chosen[1:])
     if case.keep is not None:
         chosen = np.array([0, 0]) if case.keep == 1 else chosen[: case.keep]
-    if np.array_equal(chosen, np.arange(case.frames)):
-        return whole
-    recorded: NDArray[Any] = whole.arrays()["frames"][chosen]
-    grey = recorded.shape[3] == 1
-    burst = Burst(
-        recorded[..., 0] if grey else recorded,
-        axes="TYX" if grey else "TYXC",
-        black_level=0,
-        white_level=whole.burst.white_level,
-    )
-    return SimulatedBurst(
-        burst=burst,
-        truth=whole.truth[chosen],
-        homographies=whole.homographies[chosen],
-        transmission=whole.transmission,
-        bundle=whole.bundle,
-        scene=whole.scene,
-    )
+    return whole.take(chosen)
 
 
 def comparison(*, is_quick: bool = False, is_large: bool = False) -> tuple[Case, ...]:
@@ -186,6 +185,32 @@ def conditions(*, is_quick: bool = False) -> tuple[Case, ...]:
     ]
     cases = [Case(name=name, **{**base, **change}) for name, change in changed]
     return tuple(case for case in cases if case.name in ("as it is", "2 frames")) if is_quick else tuple(cases)
+
+
+def recorded(*, is_quick: bool = False) -> tuple[Case, ...]:
+    """Return the sixth table's bursts: each fault of recorded bursts at three strengths, and a mild one of each."""
+    faults: list[tuple[str, Mapping[str, Any]]] = [
+        *[(f"flicker {100 * part:g} %", {"flicker": part}) for part in (0.02, 0.05, 0.2)],
+        *[(f"deformation {pixels:g} px", {"deformation": pixels}) for pixels in (1.0, 3.0, 6.0)],
+        *[(f"smear {part:g} of a step", {"smear": part}) for part in (0.3, 0.6, 1.0)],
+        *[(f"background {100 * part:g} %", {"background": part}) for part in (0.2, 0.5, 1.0)],
+        *[(f"vignette {times:g} x", {"vignette": times}) for times in (2.0, 4.0, 8.0)],
+        *[(f"round field {part:g}, marks", {"field": part, "overlay": True}) for part in (0.95, 0.8, 0.6)],
+        *[(f"intruder {100 * part:g} %", {"intruder": part}) for part in (0.02, 0.05, 0.15)],
+        *[(f"{n} black, {n} white", {"black_frames": n, "white_frames": n}) for n in (1, 2, 3)],
+        *[(f"bundle shift {pixels:g} px", {"bundle_shift": pixels}) for pixels in (0.5, 1.0, 2.0)],
+        *[(f"contrast {100 * part:g} %", {"contrast": part}) for part in (0.2, 0.1, 0.066)],
+        ("all, mild", _MILD),
+    ]
+    if is_quick:
+        faults = [(name, fault) for name, fault in faults if name in ("flicker 5 %", "deformation 3 px", "all, mild")]
+    scenes = ("histology",) if is_quick else ("histology", "tissue")
+    side = 96 if is_quick else 224
+    return tuple(
+        Case(name=f"{scene}, {name}", scene=scene, side=side, pitch=4.7, faults=fault)
+        for scene in scenes
+        for name, fault in faults
+    )
 
 
 def costs(*, is_quick: bool = False) -> tuple[Case, ...]:

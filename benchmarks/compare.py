@@ -1,9 +1,9 @@
 """Tables 1 and 3: every method on every burst, scored against the truth in two ways.
 
-PSNR and SSIM are of frame 0, every pixel. "Matched" is after the one gain and offset per channel that bring the
-image closest to the truth: a bundle passes only part of the light, no burst can tell how large a part, and so the
-quality of a method shows in the error that remains. "As given" is without: the paper prints it of a captured frame, and
-it depends mostly on how dark a method leaves its image.
+PSNR and SSIM are of frame 0, every pixel that is visible. "Matched" is after the one gain and offset per channel that
+bring the image closest to the truth: a bundle passes only part of the light, no burst can tell how large a part, and so
+the quality of a method shows in the error that remains. "As given" is without: the paper prints it of a captured frame,
+and it depends mostly on how dark a method leaves its image.
 """
 
 from collections.abc import Sequence
@@ -55,9 +55,7 @@ def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
     """Return how close an image and its motion come to the truth."""
     truth, image = simulated.truth[0], np.nan_to_num(outcome.image)
     row: Row = {
-        "psnr": psnr(image, truth),
-        "ssim": ssim(image, truth),
-        **as_given(image, truth),
+        **(_matched(image, truth) if simulated.visible is None else _matched_where(simulated.visible, image, truth)),
         "seconds": outcome.seconds,
         "compression": outcome.compression,
         "curve": outcome.curve,
@@ -67,6 +65,25 @@ def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
         row["motion_error"] = motion_error(outcome.homographies, simulated.homographies, truth.shape[:2])
         row["frames_used"] = int(np.isfinite(outcome.homographies).all(axis=(1, 2)).sum())
     return row
+
+
+def _matched(image: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:
+    """Return PSNR and SSIM after `match_levels`, and as given."""
+    return {"psnr": psnr(image, truth), "ssim": ssim(image, truth), **as_given(image, truth)}
+
+
+def _matched_where(visible: NDArray[np.bool_], image: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:
+    """Return the same of the visible pixels (H, W) alone; around them SSIM's windows see the truth."""
+    exact = np.asarray(truth, np.float64)
+    given, matched = exact.copy(), exact.copy()
+    given[visible] = image[visible]
+    matched[visible] = match_levels(image[visible][None], truth[visible][None])[0]
+    found: Row = {}
+    for ending, shown in (("", matched), ("_as_given", given)):
+        found[f"psnr{ending}"] = float(peak_signal_noise_ratio(exact[visible], shown[visible], data_range=1))
+        _, similarity = structural_similarity(exact, shown, data_range=1, channel_axis=2, full=True)
+        found[f"ssim{ending}"] = float(similarity[visible].mean())
+    return found
 
 
 def as_given(image: NDArray[np.floating], truth: NDArray[np.floating]) -> Row:

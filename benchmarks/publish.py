@@ -50,7 +50,7 @@ def publish(folder: Path, target: Path, numbers: Sequence[int], *, overwrite: bo
     target : Path
         Where rows, figures and curves go; `tables.md` goes beside it, where the page that shows it is.
     numbers : sequence of int
-        The tables, 1 to 5.
+        The tables, 1 to 6.
     overwrite : bool
         Delete the published rows of these tables first, where the results have rows of them.
 

@@ -6,7 +6,8 @@ from statistics import mean
 
 from benchmarks import figures
 from benchmarks.methods import METHODS
-from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, SCENES, Results
+from benchmarks.recorded import CLEAN, SHOWN
+from benchmarks.results import ABLATION, CONDITIONS, COST, REAL, RECORDED, SCENES, Results
 from benchmarks.rows import Row
 
 ABSENT = "-"  # not measured
@@ -27,7 +28,7 @@ def write(results: Results) -> Path:
 def in_markdown(results: Results) -> str:
     """Return all tables whose rows are there, with links to ``figures/NAME.png``."""
     parts = _about(results)
-    for build in (_scenes, _ablation, _conditions, _real, _costs, _start):
+    for build in (_scenes, _ablation, _conditions, _real, _costs, _recorded, _start):
         parts += build(results)
     return "\n\n".join(parts) + "\n"
 
@@ -219,6 +220,36 @@ def _costs(results: Results) -> list[str]:
             stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row["stages"].items())
             parts.append(f"Where the default's time goes ({row['case']}): {stages}.")
     return [*parts, *_time_to_quality(results)]
+
+
+def _recorded(results: Results) -> list[str]:
+    rows = results.rows(RECORDED)
+    if not rows:
+        return []
+    found = {(row["case"], row["method"]): row for row in rows}
+    labels = {"default": METHODS["default"].label, CLEAN: "the same without the fault"}
+    labels |= {name: METHODS[name].label for name in SHOWN if name not in labels}
+    names = [name for name in labels if any(method == name for _, method in found)]
+
+    def cell(case: str, name: str) -> str:
+        row = found.get((case, name))
+        return ABSENT if row is None or "missing" in row else f"{row['psnr']:.1f} / {row['ssim']:.2f}"
+
+    lines = []
+    for case in _in_order(rows, "case"):
+        own = found.get((case, "default"), {})
+        error, used = own.get("motion_error"), own.get("frames_used")
+        moved = ABSENT if error is None else f"{error:.2f} px, {used} frames"
+        lines.append([case, *(cell(case, name) for name in names), moved])
+    burst = rows[0]["burst"]
+    return [
+        "### Table 6. As recorded",
+        f"Faults of recorded bursts, one by one at three strengths, and a mild one of each. {burst['physics']} bundle, "
+        f"{burst['frames']} x {burst['side']} x {burst['side']}, pitch {burst['pitch']:g}. PSNR dB / SSIM of what is "
+        "visible of frame 0, and how far our homographies are off, with the frames used; a deformation is not in them. "
+        + _measured(rows),
+        table(["", *(labels[name] for name in names), "our motion"], lines),
+    ]
 
 
 def _start(results: Results) -> list[str]:

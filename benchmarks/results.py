@@ -21,12 +21,13 @@ from PIL import Image
 from benchmarks.rows import Row, drop_half_line, plain, put_row, read_rows, write_whole
 from napari_fiberburst.errors import OutputError
 
-SCENES, ABLATION, CONDITIONS, REAL, COST = TABLES = (
+SCENES, ABLATION, CONDITIONS, REAL, COST, RECORDED = TABLES = (
     "1 scenes",
     "2 ablation",
     "3 conditions",
     "4 real burst",
     "5 cost",
+    "6 as recorded",
 )
 PACKAGES = ("napari-fiberburst", "numpy", "scipy", "scikit-image", "torch", "matplotlib")
 

@@ -3,19 +3,21 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.cases import Case
 from benchmarks.chart import PLACES, Shown, period_of
-from benchmarks.compare import compare
+from benchmarks.compare import compare, score
 from benchmarks.methods import METHODS, Effort, PeerError
-from benchmarks.results import CONDITIONS, SCENES, Recorder, Results, write_start_curves
+from benchmarks.recorded import measure_recorded
+from benchmarks.results import CONDITIONS, RECORDED, SCENES, Recorder, Results, write_start_curves
 
 from benchmarks import __main__ as command
 from benchmarks import cases, chart, methods, publish, published_start, report, results
-from napari_fiberburst.errors import OutputError, SettingsError
+from napari_fiberburst.errors import BurstError, OutputError, SettingsError
 from napari_fiberburst.quality import psnr
 from napari_fiberburst.results.reconstruction import Canvas
 
@@ -382,3 +384,65 @@ def test_a_failed_fit_is_reported_and_leaves_the_tables(tmp_path, monkeypatch, c
     assert command.main() == 2
     assert "abacus" in capsys.readouterr().err
     assert (tmp_path / "new" / "tables.md").exists()
+
+
+UNFAULTY = Case(name="small", side=80, pitch=4.7, frames=6, channels=1)
+
+
+@pytest.fixture(scope="module")
+def recorded_rows(tmp_path_factory):
+    """Return the rows of two faulty bursts of one scene, by case and method, and their tables."""
+    faulty = [
+        replace(UNFAULTY, name="flicker", faults={"flicker": 0.2}),
+        replace(UNFAULTY, name="field", faults={"field": 0.8, "overlay": True}),
+    ]
+    with Recorder(tmp_path_factory.mktemp("recorded"), "quick") as recorder:
+        measure_recorded(recorder, faulty, ["captured", "gaussian", "default"], Effort(device="cpu"))
+        rows = {(row["case"], row["method"]): row for row in recorder.results.rows(RECORDED)}
+        return rows, report.in_markdown(recorder.results)
+
+
+def test_a_recorded_burst_is_measured_beside_the_same_one_without_its_fault(recorded_rows):
+    rows, tables = recorded_rows
+    assert {method for _, method in rows} == {"default", "gaussian", "clean"}
+    clean = UNFAULTY.make()
+    expected = score(METHODS["default"].run(UNFAULTY, clean, Effort(device="cpu")), clean)
+    assert rows["flicker", "clean"]["psnr"] == pytest.approx(expected["psnr"], abs=0.01)
+    assert rows["flicker", "default"]["psnr"] != pytest.approx(expected["psnr"], abs=0.001)
+    assert rows["field", "clean"]["seconds"] == rows["flicker", "clean"]["seconds"]  # one run serves both
+    assert rows["field", "clean"]["psnr"] != rows["flicker", "clean"]["psnr"]  # but not all of it is visible
+    assert rows["flicker", "default"]["burst"]["faults"] == {"flicker": 0.2}
+    assert "### Table 6. As recorded" in tables
+    assert "| flicker | " in tables
+
+
+def test_what_is_not_visible_does_not_count(rng):
+    case = Case(name="field", side=64, pitch=4.0, frames=2, faults={"field": 0.7, "overlay": True})
+    simulated = case.make()
+    image = 0.5 * simulated.truth[0] + 0.1
+    image[~simulated.visible] = rng.random((int((~simulated.visible).sum()), 3))
+    row = score(methods.Outcome(image=image, seconds=0.0), simulated)
+    assert row["psnr"] > 100
+    assert row["ssim"] == pytest.approx(1)
+    error = np.square((0.5 * simulated.truth[0] - 0.1)[simulated.visible]).mean()
+    assert row["psnr_as_given"] == pytest.approx(-10 * np.log10(error), abs=1e-4)
+    assert 0 < row["ssim_as_given"] < 0.99
+
+
+def test_a_recorded_burst_that_a_method_refuses_has_the_reason_in_its_row(tmp_path, monkeypatch):
+    def refuse(case, simulated, effort):
+        raise BurstError("no cores are seen")
+
+    monkeypatch.setitem(METHODS, "default", replace(METHODS["default"], run=refuse))
+    with Recorder(tmp_path, "quick") as recorder:
+        measure_recorded(recorder, [replace(SMALL, faults={"flicker": 0.1})], ["default"], Effort())
+    assert [row["missing"] for row in recorder.results.rows(RECORDED)] == ["no cores are seen"] * 2
+
+
+def test_faults_change_nothing_but_the_recording():
+    for case in cases.recorded(is_quick=True):
+        faulty, clean = case.make(), replace(case, faults={}).make()
+        np.testing.assert_array_equal(faulty.truth[0], clean.truth[0])
+        np.testing.assert_array_equal(faulty.homographies, clean.homographies)
+        assert not np.array_equal(faulty.burst.frames, clean.burst.frames)
+    assert len({case.name for case in cases.recorded()}) == len(cases.recorded()) == 62

@@ -12,6 +12,7 @@ import pytest
 import tifffile
 
 from napari_fiberburst.cli import demo, main
+from napari_fiberburst.simulation import Faults, simulate
 
 SMALL = ["--preset", "paper", "--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
 
@@ -28,6 +29,53 @@ def test_simulate_writes_the_burst_and_its_truth(burst_file):
         assert arrays["frames"].shape == arrays["truth"].shape == (3, 33, 41, 3)
         assert arrays["homographies"].shape == (3, 3, 3)
         assert arrays["transmission"].shape == (33, 41)
+
+
+def test_simulate_takes_every_fault_as_an_option(tmp_path):
+    path = tmp_path / "faulty.npz"
+    command = ["simulate", "-o", str(path), "--shape", "43x51", "--frames", "5", "--pitch", "4", "--channels", "1"]
+    faults = ["--flicker", "0.05", "--deformation", "2", "--deformation-length", "30", "--vignette", "3", "--overlay"]
+    assert main([*command, *faults, "--black-frames", "1", "--contrast", "0.1"]) == 0
+    simulated = simulate(
+        shape=(43, 51),
+        frames=5,
+        pitch=4.0,
+        channels=1,
+        faults=Faults(
+            flicker=0.05,
+            deformation=2.0,
+            deformation_length=30.0,
+            vignette=3.0,
+            overlay=True,
+            black_frames=1,
+            contrast=0.1,
+        ),
+    )
+    with np.load(path) as arrays:
+        assert set(arrays) == set(simulated.arrays())
+        for name, array in simulated.arrays().items():
+            np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_simulate_takes_a_flat_field_image_as_the_bundle(tmp_path):
+    flat = simulate(shape=(67, 83), frames=1, pitch=6.0).transmission
+    tifffile.imwrite(tmp_path / "flat.tif", np.rint(1000 * flat).astype(np.uint16))
+    path = tmp_path / "burst.npz"
+    command = ["simulate", "-o", str(path), "--flat", str(tmp_path / "flat.tif"), "--frames", "3"]
+    assert main([*command, "--physics", "core"]) == 0
+    with np.load(path) as arrays:
+        assert arrays["frames"].shape == (3, 67, 83, 3)
+        bright = (flat > 0.4) & (arrays["transmission"] > 0)
+        assert bright.mean() > 0.2
+        np.testing.assert_allclose(
+            arrays["transmission"][bright] / flat[bright], 1 / np.quantile(flat, 0.999), rtol=0.01
+        )
+
+
+def test_simulate_refuses_faults_that_cannot_be(tmp_path, capsys):
+    assert main(["simulate", "-o", str(tmp_path / "a.npz"), "--shape", "33x41", "--flicker", "-1"]) == 2
+    assert "flicker must be a number of at least 0" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_info_tells_what_a_burst_holds(burst_file, capsys):

@@ -11,7 +11,7 @@ from npe2 import PluginManifest
 
 from napari_fiberburst.plugin import contributions
 from napari_fiberburst.plugin.preferences import Preferences, preferences
-from napari_fiberburst.simulation import SCENES
+from napari_fiberburst.simulation import SCENES, Faults, simulate
 
 MANIFEST = PluginManifest.from_distribution("napari-fiberburst")
 
@@ -22,9 +22,16 @@ def test_every_command_can_be_loaded():
         assert callable(getattr(__import__(module, fromlist=[name]), name))
 
 
-def test_every_scene_is_a_sample_in_both_physics():
+FAULTY = {
+    "tissue_bending": {"displacement"},
+    "histology_faint": {"exposures"},
+    "retina_round": {"visible", "shading"},
+}
+
+
+def test_every_scene_is_a_sample_in_both_physics_and_some_have_faults():
     keys = {sample.key for sample in MANIFEST.contributions.sample_data}
-    assert keys == {f"{scene}_{physics}" for scene in SCENES for physics in ("mask", "core")}
+    assert keys == {f"{scene}_{physics}" for scene in SCENES for physics in ("mask", "core")} | set(FAULTY)
 
 
 def test_opening_a_menu_loads_no_torch():
@@ -42,6 +49,22 @@ def test_a_sample_carries_its_truth(key):
     assert frames.dtype == np.uint8
     assert look["rgb"] == (frames.ndim == 4)
     assert metadata["homographies"].shape == (20, 3, 3)
+
+
+@pytest.mark.parametrize("key", FAULTY)
+def test_a_faulty_sample_is_told_from_others_by_its_name_its_recipe_and_its_truth(key):
+    ((frames, look, _),) = getattr(contributions, key)()
+    metadata = look["metadata"]["fiberburst"]
+    assert frames.shape == (20, 256, 256, 3)
+    assert FAULTY[key] <= set(metadata)
+    assert not {"frames", "axes", "white_level"} & set(metadata)
+    faults = {name: value for name, value in metadata["recipe"].items() if name not in ("scene", "physics")}
+    assert faults
+    for name in faults:
+        assert name.replace("_", " ") in look["name"]
+    scene, physics = metadata["recipe"]["scene"], metadata["recipe"]["physics"]
+    again = simulate(scene, physics=physics, faults=Faults(**faults))
+    np.testing.assert_array_equal(again.arrays()["frames"], frames)
 
 
 def test_an_npz_burst_opens_with_its_truth(tmp_path, simulated):

@@ -117,6 +117,10 @@ def test_a_simulated_burst_is_simulated_by_its_command():
         "fiberburst simulate --scene cat --physics core -o burst.npz",
         "fiberburst reconstruct burst.npz -o image.ome.tif --preset paper",
     ]
+    faulty = {"scene": "cat", "deformation_length": 40.0, "overlay": True}
+    assert as_command(source(recipe=faulty), {}).startswith(
+        "fiberburst simulate --scene cat --deformation-length 40.0 --overlay -o burst.npz\n"
+    )
 
 
 def test_history_keeps_the_first_the_newest_and_an_even_part_between():

@@ -14,7 +14,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         texts = [f"{name}: {text}" for of, name, text in choice_docs() if of == part]
         parser.add_argument(f"--{part}", choices=known, help=" ".join(texts).replace("%", "%%"))
     for name, parameter in all_keywords().items():
-        _add(parser, parameter, " and ".join(choice for _, choice in owners_of(name)))
+        add_parameter(parser, parameter, " and ".join(choice for _, choice in owners_of(name)))
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -41,8 +41,13 @@ def parse_shape(text: str) -> tuple[int, int]:
     return height, width
 
 
-def _add(parser: argparse.ArgumentParser, parameter: Parameter, owner: str) -> None:
-    default = "" if parameter.default is None else f"default {parameter.default}"
+def add_parameter(parser: Any, parameter: Parameter, owner: str = "") -> None:
+    """Add an option for a parameter to a parser or a group of one; unset, it is None.
+
+    `owner` names the choices that the parameter belongs to.
+    """
+    value = f"{parameter.default:g}" if isinstance(parameter.default, float) else parameter.default
+    default = "" if value is None else f"default {value}"
     remarks = "; ".join(filter(None, [owner and f"{owner} only", default]))
     text = f"{parameter.doc} ({remarks})" if remarks else parameter.doc
     if parameter.kind is bool:

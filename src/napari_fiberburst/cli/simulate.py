@@ -1,16 +1,22 @@
 """``fiberburst simulate``."""
 
 import argparse
+from collections.abc import Iterable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from napari_fiberburst.cli.arguments import parse_shape
+from napari_fiberburst.cli.arguments import add_parameter, parse_shape
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.folder import read_image
 from napari_fiberburst.io.results import check_place, write_whole
-from napari_fiberburst.simulation import MOTIONS, SCENES, simulate
+from napari_fiberburst.settings.parameter import parameters_of
+from napari_fiberburst.simulation import MOTIONS, SCENES, Faults, simulate
 from napari_fiberburst.simulation.simulate import PHYSICS
+
+_BUNDLE_OPTIONS = ("pitch", "dead_cores", "outline")
 
 
 def add_to(commands: Any) -> None:
@@ -22,15 +28,19 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="a file ending in .npz")
     parser.add_argument("--scene", choices=SCENES, default="histology", help="what there is to see")
-    parser.add_argument("--shape", type=parse_shape, default=(256, 256), metavar="HxW", help="default 256x256")
+    parser.add_argument("--shape", type=parse_shape, metavar="HxW", help="default 256x256, or that of --flat")
     parser.add_argument("--frames", type=int, default=20, help="default 20")
     parser.add_argument("--channels", type=int, help="default, the scene's own")
     parser.add_argument("--motion", choices=MOTIONS, default="brownian", help="how the object moves")
     parser.add_argument("--physics", choices=PHYSICS, default="mask", help="what a core does to the light")
-    parser.add_argument("--pitch", type=float, default=7.0, help="distance of cores in pixels, default 7")
-    parser.add_argument("--dead-cores", type=float, default=0.0, help="part of the cores that are dark, default 0")
-    parser.add_argument("--outline", choices=("frame", "circle"), default="frame", help="what the cores fill")
+    parser.add_argument("--pitch", type=float, help="distance of cores in pixels, default 7")
+    parser.add_argument("--dead-cores", type=float, help="part of the cores that are dark, default 0")
+    parser.add_argument("--outline", choices=("frame", "circle"), help="what the cores fill, default frame")
+    parser.add_argument("--flat", type=Path, help="image of a real bundle in even light, which becomes the bundle")
     parser.add_argument("--seed", type=int, default=0, help="the same seed gives the same burst")
+    faults = parser.add_argument_group("faults", "what is wrong with the recording; default, nothing")
+    for parameter in parameters_of(Faults).values():
+        add_parameter(faults, parameter)
     parser.set_defaults(run=run)
 
 
@@ -46,12 +56,17 @@ def run(options: argparse.Namespace) -> int:
         channels=options.channels,
         motion=options.motion,
         physics=options.physics,
+        faults=Faults(**_given(options, [item.name for item in fields(Faults)])),
+        flat=None if options.flat is None else read_image(options.flat),
         seed=options.seed,
-        pitch=options.pitch,
-        dead_cores=options.dead_cores,
-        outline=options.outline,
+        **_given(options, _BUNDLE_OPTIONS),
     )
     with write_whole(options.output) as stream:
         np.savez_compressed(stream, allow_pickle=False, **simulated.arrays())
     print(f"wrote {options.output}: {simulated.burst}")
     return 0
+
+
+def _given(options: argparse.Namespace, names: Iterable[str]) -> dict[str, Any]:
+    """Return those of the named options that were given, by name."""
+    return {name: getattr(options, name) for name in names if getattr(options, name) is not None}

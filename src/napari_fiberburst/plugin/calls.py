@@ -46,7 +46,7 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSo
     lines = []
     if path is None and source.recipe:
         path = "burst.npz"
-        options = [word for name, value in source.recipe.items() for word in (f"--{name}", str(value))]
+        options = [word for name, value in source.recipe.items() for word in _option(name, value)]
         lines.append(shlex.join(["fiberburst", "simulate", *options, "-o", path]))
     elif path is None:
         path = "burst.tif"
@@ -58,15 +58,21 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSo
         (y0, y1), (x0, x1) = source.region
         words += ["--crop", f"{y0}:{y1},{x0}:{x1}"]
     for name, value in choices.items():
-        option = name.replace("_", "-")
-        flag = [f"--{option}" if value else f"--no-{option}"]
-        words += flag if isinstance(value, bool) else [f"--{option}", str(value)]
+        words += _option(name, value)
     if bundle is not None and bundle.path is not None:
         words += ["--bundle", bundle.path]
     elif bundle is not None:
         lines.append(f"# save layer {bundle.name!r} as calibration.tif first")
         words += ["--calibration", "calibration.tif"]
     return "\n".join([*lines, shlex.join(words)]) + "\n"
+
+
+def _option(name: str, value: object) -> list[str]:
+    """Return a setting as the words of a command line."""
+    option = name.replace("_", "-")
+    if isinstance(value, bool):
+        return [f"--{option}" if value else f"--no-{option}"]
+    return [f"--{option}", str(value)]
 
 
 def _file_tells_axes(source: BurstSource) -> bool:

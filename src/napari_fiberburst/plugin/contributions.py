@@ -3,7 +3,7 @@
 Imported when napari starts to use one of them; loads neither torch nor, before it is needed, napari.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,35 +20,35 @@ LayerData = tuple[Any, dict[str, Any], str]
 _PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
+# What a file of a simulated burst holds of the recording; all else is truth.
+_RECORDING = {"frames", "axes", "black_level", "white_level"}
 # RGBA of a bundle's cores by their state, as `Bundle.image` has them, and the quantile of light that is shown white.
 _CORE_COLOURS = {"core": (0.5, 0.8, 0.4, 1.0), "saturated": (1.0, 0.3, 0.3, 1.0), "dead": (0.2, 0.4, 1.0, 1.0)}
 _BRIGHTEST = 0.99
 
 
-def make_sample(scene: str, physics: str) -> list[LayerData]:
+def make_sample(scene: str, physics: str, **faults: Any) -> list[LayerData]:
     """Return a simulated burst as an image layer, its truth in the layer's metadata.
 
     Parameters
     ----------
     scene, physics : str
         As in `napari_fiberburst.simulation.simulate`.
+    **faults
+        As in `napari_fiberburst.simulation.Faults`.
     """
-    from napari_fiberburst.simulation import simulate
+    from napari_fiberburst.simulation import Faults, simulate
 
-    simulated = simulate(scene, shape=_SAMPLE_SHAPE, frames=_SAMPLE_FRAMES, physics=physics)
+    simulated = simulate(
+        scene, shape=_SAMPLE_SHAPE, frames=_SAMPLE_FRAMES, physics=physics, faults=Faults(**faults) if faults else None
+    )
     arrays = simulated.arrays()
     frames, is_grey = arrays["frames"], simulated.scene.channels == 1
-    metadata = {
-        "recipe": {"scene": scene, "physics": physics},
-        "truth": arrays["truth"],
-        "homographies": arrays["homographies"],
-        "transmission": arrays["transmission"],
-    }
     look = {
-        "name": f"{scene} ({physics})",
+        "name": f"{scene} ({', '.join([physics, *(name.replace('_', ' ') for name in faults)])})",
         "rgb": not is_grey,
         "axis_labels": ("t", "y", "x"),
-        "metadata": {METADATA_KEY: metadata},
+        "metadata": {METADATA_KEY: {"recipe": {"scene": scene, "physics": physics, **faults}, **_truth_in(arrays)}},
     }
     return [(frames[..., 0] if is_grey else frames, look, "image")]
 
@@ -64,6 +64,9 @@ tissue_mask = partial(make_sample, "tissue", "mask")
 tissue_core = partial(make_sample, "tissue", "core")
 cat_mask = partial(make_sample, "cat", "mask")
 cat_core = partial(make_sample, "cat", "core")
+tissue_bending = partial(make_sample, "tissue", "core", deformation=3.0)
+histology_faint = partial(make_sample, "histology", "core", flicker=0.05, contrast=0.07)
+retina_round = partial(make_sample, "retina", "core", field=0.95, overlay=True, vignette=2.0)
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
@@ -215,6 +218,11 @@ def _look(burst: "Burst", path: Path, *, is_colour: bool) -> dict[str, Any]:
     return look
 
 
+def _truth_in(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is known of a simulated burst beside its recording."""
+    return {name: arrays[name] for name in arrays if name not in _RECORDING}
+
+
 def _truth(path: Path) -> dict[str, Any]:
     """Return the truth that a simulated burst's file carries."""
     if path.suffix.lower() != ".npz":
@@ -222,4 +230,4 @@ def _truth(path: Path) -> dict[str, Any]:
     with np.load(path, allow_pickle=False) as arrays:
         if not {"truth", "homographies"} <= set(arrays):
             return {}
-        return {name: arrays[name] for name in ("truth", "homographies", "transmission") if name in arrays}
+        return _truth_in(arrays)

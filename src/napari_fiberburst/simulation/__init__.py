@@ -2,6 +2,7 @@
 
 from napari_fiberburst.simulation.bundle import Bundle, make_bundle
 from napari_fiberburst.simulation.camera import Camera
+from napari_fiberburst.simulation.faults import Faults
 from napari_fiberburst.simulation.motion import MOTIONS, brownian_motion, handheld_motion, raster_motion
 from napari_fiberburst.simulation.scenes import SCENES, Scene, make_scene
 from napari_fiberburst.simulation.simulate import SimulatedBurst, simulate
@@ -11,6 +12,7 @@ __all__ = [
     "SCENES",
     "Bundle",
     "Camera",
+    "Faults",
     "Scene",
     "SimulatedBurst",
     "brownian_motion",
