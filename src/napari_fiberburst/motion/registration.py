@@ -98,6 +98,9 @@ class Registration(Stored):
     residual : float
         Root of the weighted mean square of what the model leaves of the samples, full scale 1; NaN before the first
         iteration.
+    travel : float
+        How far the frames' corners lie from where they are on average, root mean square, pixels; NaN while that is not
+        known.
     is_still : bool
         Whether the object moves too little to fill the gaps between cores.
     stage : str
@@ -122,6 +125,7 @@ class Registration(Stored):
     gains: NDArray[np.float32]
     exposures: NDArray[np.float32]
     residual: float = float("nan")
+    travel: float = float("nan")
     is_still: bool = False
     stage: Stage = "none"
     iterations: int = 0
@@ -447,7 +451,7 @@ def _judged(found: Registration, samples: Samples) -> Registration:
         left_out = ", ".join(str(number) for number in np.flatnonzero(~used))
         judged = _noted(judged, f"frames that could not be registered are left out: {left_out}")
     travel = _travel(judged.reference_from_frame[used], samples.shape)
-    return replace(judged, is_still=bool(travel < _LEAST_MOTION * samples.pitch))
+    return replace(judged, travel=travel, is_still=bool(travel < _LEAST_MOTION * samples.pitch))
 
 
 def _still(found: Registration) -> Registration:

@@ -26,13 +26,15 @@ from napari_fiberburst.motion.registration import Registration, refining, regist
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.scene.image import SplineImage
-from napari_fiberburst.scene.solve import Scene, grid_over, solve_quickly, solving
+from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
 from napari_fiberburst.settings import SplineMethod
 
 logger = logging.getLogger(__name__)
 
 # Spacing of the first preview's nodes, pixels or, in coarse bundles, pitches.
 _PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
+# In pitches: where an object travels less (root mean square), registration starts from two places.
+_SHORT_TRAVEL = 1.0
 # A union of frames reaches at most so many frames' sizes from the reference frame.
 _MOST_FIELDS = 5
 # Nodes with less than this weight of samples have been seen by none.
@@ -117,6 +119,8 @@ class Stages:
         fitted = Fitted(bundle=bundle, registration=unregistered(samples), canvas=self._frame_canvas(), notes=notes)
         yield fitted
         fitted = yield from self._register(fitted, samples)
+        if self._is_start_in_doubt(fitted):
+            fitted = yield from self._from_equal_gains(fitted)
         return (yield from self._refine(fitted))
 
     def solve(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
@@ -200,6 +204,25 @@ class Stages:
         fitted = self._sketched(fitted)
         yield fitted
         return fitted
+
+    def _is_start_in_doubt(self, fitted: Fitted) -> bool:
+        """Whether the mean frame may show the object rather than the gains, because the object hardly moves."""
+        bundle, travel = fitted.bundle, fitted.registration.travel
+        return bundle.is_resolved and not bundle.gains_known and travel < _SHORT_TRAVEL * bundle.pitch
+
+    def _from_equal_gains(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
+        """Register once more from equal gains, and keep that start whose samples predict one another better."""
+        bundle = with_even_gains(fitted.bundle)
+        samples = sample_cores(self._grey[..., None], bundle, self._burst)
+        again = replace(fitted, bundle=bundle, registration=unregistered(samples), scene=None, image=None)
+        again = yield from self._register(again, samples)
+        return again if self._error(again) < self._error(fitted) else fitted
+
+    def _error(self, fitted: Fitted) -> float:
+        """Return by how much samples that are left out are missed, relative to their mean light."""
+        samples = sample_cores(self._grey[..., None], fitted.bundle, self._burst)
+        grid = self._grid(max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch), fitted)
+        return prediction_error(samples, fitted.registration, grid, seed=self._seed)
 
     def _with_equal_cores(self, fitted: Fitted) -> Fitted:
         """Take all cores as equal: without motion a core's gain cannot be told from what it sees."""
