@@ -19,7 +19,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
 from napari_fiberburst.bundle.pitch import find_pitch
-from napari_fiberburst.bundle.samples import SATURATED, sample_cores
+from napari_fiberburst.bundle.samples import SATURATED, exposed, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.operators.filters import blur, local_mean
@@ -40,8 +40,6 @@ _DARK = 0.04
 _BLACK_QUANTILE = 0.002
 # In pitches: a core's footprint before its profile has been measured.
 _USUAL_RADIUS = 0.36
-# Frames that vary less than this part of the median frame are black, white or empty in another way.
-_LEAST_CONTRAST_OF_USUAL = 0.2
 # The mean of few frames still shows an object of much contrast (standard deviation of a core's light over the frames,
 # relative to its mean), and a gain taken from it would hide that object: all cores then start as equal. In low contrast
 # the cores' own differences would hold the object still.
@@ -75,8 +73,9 @@ def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
 
 def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, Bundle]:
     """Calibrate the bundle from grey frames (T, H, W) in [0, 1]; yields the name of each step that is done."""
-    mean = grey[exposed(grey)].mean(dim=0)
     origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
+    grey = grey[exposed(grey)]
+    mean = grey.mean(dim=0)
     bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin)), grey)
     if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
         samples = sample_cores(grey[..., None], bundle, acquisition)
@@ -135,14 +134,6 @@ def calibrating_mean(
         provenance=told,
     )
     return with_transmission(draft, passed)
-
-
-def exposed(frames: Tensor) -> Tensor:
-    """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
-    deviation = frames.std(dim=(1, 2))
-    bright = (frames >= SATURATED).float().mean(dim=(1, 2))
-    good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
-    return good if bool(good.any()) else torch.ones_like(good)
 
 
 def with_transmission(bundle: Bundle, transmission: Tensor) -> Bundle:
