@@ -21,7 +21,7 @@ _LEAST_SIGN = 0.3
 _PITCH_PER_ROW = 2 / math.sqrt(3)
 
 
-def find_pitch(image: Tensor) -> float | None:
+def find_pitch(image: Tensor, field: Tensor | None = None) -> float | None:
     """Return the distance of neighbouring cores in pixels, or None where the image shows no bundle.
 
     The spectrum is averaged over directions, so that a lattice of many grains, which has no direction of its own and
@@ -31,8 +31,11 @@ def find_pitch(image: Tensor) -> float | None:
     ----------
     image : Tensor
         (H, W), such as the mean of a burst, in which the object is smeared and the bundle is not.
+    field : Tensor, optional
+        (H, W) bool, where to look; everywhere by default.
     """
-    frequency, power = _radial_spectrum(image)
+    weight = torch.ones_like(image) if field is None else field.to(image)
+    frequency, power = _radial_spectrum(image, weight)
     level = np.log(power + 1e-9 * power.max())
     level = np.convolve(np.pad(level, 2, mode="edge"), np.array([1, 4, 6, 4, 1]) / 16, mode="valid")
     best, peak = -np.inf, None
@@ -49,20 +52,29 @@ def find_pitch(image: Tensor) -> float | None:
         return None
     near = slice(max(0, peak - 2), peak + 3)
     pitch = float(_PITCH_PER_ROW / np.average(frequency[near], weights=power[near]))
-    envelope = local_mean(image, 3 * pitch)
-    lit = envelope > 0.1 * envelope.max()
-    contrast = float((image[lit] / envelope[lit]).std())
+    contrast = _contrast(image, pitch, weight)
     if contrast < _LEAST_CONTRAST:
         return None
     return pitch if best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
 
 
-def _radial_spectrum(image: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies, cycles per pixel, and the mean power at each, with the image's slow changes divided out."""
+def _contrast(image: Tensor, pitch: float, weight: Tensor) -> float:
+    """Return the standard deviation of an image about its own blur over three pitches, in parts of that."""
+    envelope = local_mean(image, 3 * pitch, weight)
+    lit = (envelope > 0.1 * envelope.max()) & (weight > 0)
+    return float((image[lit] / envelope[lit]).std())
+
+
+def _radial_spectrum(image: Tensor, weight: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequencies, cycles per pixel, and the mean power at each, with the image's slow changes divided out.
+
+    What has no weight (H, W) is left out.
+    """
     height, width = image.shape
-    envelope = local_mean(image, 12.0)
+    envelope = local_mean(image, 12.0, weight)
     flat = image / (envelope + 1e-3 * image.max())
     window = torch.hann_window(height, device=image.device)[:, None] * torch.hann_window(width, device=image.device)
+    window = window * weight
     flat = (flat - (flat * window).sum() / window.sum()) * window
     power = torch.fft.rfft2(flat).abs().square().cpu()
     frequency = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)[None, :])
