@@ -19,7 +19,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
 from napari_fiberburst.bundle.field import find_field, widened, without_rim
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
-from napari_fiberburst.bundle.pitch import find_pitch
+from napari_fiberburst.bundle.pitch import find_pitch, is_faint
 from napari_fiberburst.bundle.samples import SATURATED, exposed, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
@@ -110,7 +110,7 @@ def calibrating_mean(
     plain = _blocks(torch.ones_like(mean), inner, acquisition, pattern="none", black=0.0, provenance=told)
     if pitch is None:
         return plain
-    black = float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
+    black = _black_level(mean, pitch, field)
     # The outermost cores shine beyond the field.
     reached = widened(field, pitch)
     light = (mean - black).clamp_min(0) * reached
@@ -224,6 +224,17 @@ def _version() -> str:
         return version("napari-fiberburst")
     except PackageNotFoundError:  # run from its sources
         return "unknown"
+
+
+def _black_level(mean: Tensor, pitch: float, field: Tensor) -> float:
+    """Return the intensity without light in a mean frame (H, W), full scale 1.
+
+    A bundle is black between its cores and about its field. A faint one that fills the frame shows no black at all: its
+    darkest place is as bright as the object there, so the black level of the recording has to do.
+    """
+    if bool(field.all()) and is_faint(mean, pitch, field):
+        return 0.0
+    return float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
 
 
 def _blocks(

@@ -14,9 +14,13 @@ LEAST_PITCH, MOST_PITCH = 2.3, 24.0
 # A bundle is told by two signs together: how far its ring stands out of the spectrum on both sides of it (natural
 # logarithm of power), and how much the image varies about its own blur. Simulated bundles, jittered, few cores
 # across, with bright fibres behind them, have 0.2 to 2.5 and 0.7 to 1.4; plain scenes at most 0.4 in the one and, where
-# they have less than 0 there, 0.6 in the other.
-_USUAL_CONTRAST, _LEAST_CONTRAST = 0.5, 0.1
-_LEAST_SIGN = 0.3
+# they have less than 0 there, 0.6 in the other. A ring that stands out by much is sign enough, because a faint bundle
+# (0.05 to 0.1 in the other, 1.1 to 3.5 in the one) hardly varies. What varies less than that is no bundle: the blocks
+# of a compressed video have 2 in the one and 0.015 in the other.
+_USUAL_CONTRAST, _LEAST_CONTRAST = 0.5, 0.03
+_LEAST_SIGN, _CLEAR_RING = 0.3, 1.0
+# Below this contrast a bundle is faint.
+_FAINT = 0.1
 # Rows of a hexagonal lattice stand closer than its cores.
 _PITCH_PER_ROW = 2 / math.sqrt(3)
 
@@ -55,7 +59,12 @@ def find_pitch(image: Tensor, field: Tensor | None = None) -> float | None:
     contrast = _contrast(image, pitch, weight)
     if contrast < _LEAST_CONTRAST:
         return None
-    return pitch if best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
+    return pitch if best > _CLEAR_RING or best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
+
+
+def is_faint(image: Tensor, pitch: float, field: Tensor) -> bool:
+    """Whether the space between cores is nearly as bright as they are, in the field of an image (H, W)."""
+    return _contrast(image, pitch, field.to(image)) < _FAINT
 
 
 def _contrast(image: Tensor, pitch: float, weight: Tensor) -> float:
