@@ -123,6 +123,12 @@ def test_smooth_noise_shows_no_faint_bundle(width, rng):
         assert find_pitch(torch.from_numpy(0.5 + 0.03 * noise / noise.std()).float()) is None
 
 
+def test_what_alternates_from_pixel_to_pixel_is_no_bundle():
+    """At the camera's own period there is nothing beyond, so a ring cannot be told from the end of the spectrum."""
+    even = (9 + np.indices((91, 103)).sum(axis=0) % 2) / 255
+    assert find_pitch(torch.from_numpy(even).float()) is None
+
+
 def test_the_blocks_of_a_compressed_video_are_no_bundle(rng):
     """They draw lines into the spectrum, but hardly into the image."""
     image = 0.5 + 0.1 * gaussian_filter(rng.normal(size=(208, 232)), 6)

@@ -14,13 +14,12 @@ LEAST_PITCH, MOST_PITCH = 2.3, 24.0
 # A bundle is told by two signs together: how far its ring stands out of the spectrum on both sides of it (natural
 # logarithm of power), and how much the image varies about its own blur. Simulated bundles, jittered, few cores
 # across, with bright fibres behind them, have 0.2 to 2.5 and 0.7 to 1.4; plain scenes at most 0.4 in the one and, where
-# they have less than 0 there, 0.6 in the other. A ring that stands out by much is sign enough, because a faint bundle
-# (0.05 to 0.1 in the other, 1.1 to 3.5 in the one) hardly varies. What varies less than that is no bundle: the blocks
-# of a compressed video have 2 in the one and 0.015 in the other.
-_USUAL_CONTRAST, _LEAST_CONTRAST = 0.5, 0.03
-_LEAST_SIGN, _CLEAR_RING = 0.3, 1.0
-# Below this contrast a bundle is faint.
-_FAINT = 0.1
+# they have less than 0 there, 0.6 in the other.
+_USUAL_CONTRAST, _LEAST_SIGN = 0.5, 0.3
+# Faint bundles vary by 0.05 to 0.1, and their ring alone tells them: it has 1.1 to 3.5 where plain scenes have at most
+# 0.5. What varies less is no bundle: the blocks of a compressed video draw a ring of 2 at 0.015. Neither is what lies
+# at the end of the spectrum, where a ring has one side only.
+_FAINT, _LEAST_CONTRAST, _CLEAR_RING = 0.1, 0.03, 1.0
 # Rows of a hexagonal lattice stand closer than its cores.
 _PITCH_PER_ROW = 2 / math.sqrt(3)
 
@@ -42,7 +41,7 @@ def find_pitch(image: Tensor, field: Tensor | None = None) -> float | None:
     frequency, power = _radial_spectrum(image, weight)
     level = np.log(power + 1e-9 * power.max())
     level = np.convolve(np.pad(level, 2, mode="edge"), np.array([1, 4, 6, 4, 1]) / 16, mode="valid")
-    best, peak = -np.inf, None
+    best, peak, is_between = -np.inf, None, False
     for index, centre in enumerate(frequency):
         if not LEAST_PITCH <= _PITCH_PER_ROW / centre <= MOST_PITCH:
             continue
@@ -51,15 +50,17 @@ def find_pitch(image: Tensor, field: Tensor | None = None) -> float | None:
         sides = [np.median(level[side]) for side in (below, above) if side.any()]
         prominence = level[index] - max(sides, default=np.inf)
         if prominence > best:
-            best, peak = prominence, index
+            best, peak, is_between = prominence, index, len(sides) == 2
     if peak is None:
         return None
     near = slice(max(0, peak - 2), peak + 3)
     pitch = float(_PITCH_PER_ROW / np.average(frequency[near], weights=power[near]))
     contrast = _contrast(image, pitch, weight)
-    if contrast < _LEAST_CONTRAST:
-        return None
-    return pitch if best > _CLEAR_RING or best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
+    if contrast < _FAINT:
+        is_bundle = contrast > _LEAST_CONTRAST and best > _CLEAR_RING and is_between
+    else:
+        is_bundle = best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN
+    return pitch if is_bundle else None
 
 
 def is_faint(image: Tensor, pitch: float, field: Tensor) -> bool:
