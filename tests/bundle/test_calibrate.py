@@ -7,12 +7,13 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from napari_fiberburst import Burst
+from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrate
 from napari_fiberburst.bundle.pitch import find_pitch
 from napari_fiberburst.bundle.samples import sample
 from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.quality import psnr
 from napari_fiberburst.simulation import Camera, simulate
 from napari_fiberburst.simulation.bundle import Bundle as SimulatedBundle
 
@@ -126,3 +127,39 @@ def test_saturated_pixels_are_left_out():
     assert not sample(spoiled, scaled, "cores").weights[1].any()
     assert not sample(spoiled, scaled, "pixels").weights[1].any()
     assert sample(spoiled, scaled, "pixels").weights[0].any()
+
+
+def test_black_and_white_frames_leave_no_trace_in_the_calibration():
+    simulated = simulate("histology", shape=(120, 131), frames=6, pitch=7.0, physics="core", channels=1)
+    frames = simulated.arrays()["frames"].reshape(6, 120, 131)
+    y, x = np.indices((120, 131))
+    # Over-exposed in four frames out of six, which is most of them; with three black ones more, four out of nine.
+    frames[:4, np.hypot(x - 60, y - 60) < 15] = 255
+    spoiled = np.concatenate([frames, np.zeros_like(frames[:3]), np.full_like(frames[:1], 255)])
+    alone, among = (calibrate(Burst(part, black_level=0, white_level=255)) for part in (frames, spoiled))
+    assert alone.saturated.sum() > 5
+    for name in ("centres", "labels", "transmission", "saturated", "outline"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(among, name))
+
+
+@pytest.mark.parametrize("kind", ["cores", "pixels"])
+def test_frames_that_show_nothing_have_no_samples(kind):
+    simulated = simulate("histology", shape=(120, 110), pitch=7.0, frames=5)
+    frames = simulated.burst.frames.copy()
+    frames[1], frames[3] = 0, 1
+    weights = sample(Burst(frames, black_level=0, white_level=1), calibrate(simulated.burst), kind).weights
+    assert (weights > 0).any(dim=1).tolist() == [True, False, True, False, True]
+
+
+def test_a_black_and_a_white_frame_cost_nothing():
+    """The frames that are left must give what they would have given without those two."""
+    simulated = simulate("cat", shape=(151, 163), frames=20, pitch=6.0, physics="core", seed=1)
+    frames = simulated.arrays()["frames"]
+    spoiled = frames.copy()
+    spoiled[5], spoiled[12] = 0, 255
+    kept = np.delete(frames, [5, 12], axis=0)
+    without, among = (
+        psnr(reconstruct(Burst(part, black_level=0, white_level=255), fill=True).image, simulated.truth[0])
+        for part in (kept, spoiled)
+    )
+    assert among > without - 0.1

@@ -17,9 +17,10 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
+from napari_fiberburst.bundle.field import find_field, widened, without_rim
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
-from napari_fiberburst.bundle.pitch import find_pitch
-from napari_fiberburst.bundle.samples import SATURATED, sample_cores
+from napari_fiberburst.bundle.pitch import find_pitch, is_faint
+from napari_fiberburst.bundle.samples import SATURATED, exposed, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.operators.filters import blur, local_mean
@@ -40,8 +41,6 @@ _DARK = 0.04
 _BLACK_QUANTILE = 0.002
 # In pitches: a core's footprint before its profile has been measured.
 _USUAL_RADIUS = 0.36
-# Frames that vary less than this part of the median frame are black, white or empty in another way.
-_LEAST_CONTRAST_OF_USUAL = 0.2
 # The mean of few frames still shows an object of much contrast (standard deviation of a core's light over the frames,
 # relative to its mean), and a gain taken from it would hide that object: all cores then start as equal. In low contrast
 # the cores' own differences would hold the object still.
@@ -75,9 +74,11 @@ def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
 
 def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, Bundle]:
     """Calibrate the bundle from grey frames (T, H, W) in [0, 1]; yields the name of each step that is done."""
-    mean = grey[exposed(grey)].mean(dim=0)
     origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
-    bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin)), grey)
+    grey = grey[exposed(grey)]
+    mean = grey.mean(dim=0)
+    field = find_field(grey, find_pitch(mean))
+    bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin, field)), grey)
     if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
         samples = sample_cores(grey[..., None], bundle, acquisition)
         light = samples.values[..., 0]
@@ -88,31 +89,44 @@ def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, 
 
 
 def calibrating_mean(
-    mean: Tensor, acquisition: Acquisition, provenance: dict[str, Any], *, even_light: bool = False
+    mean: Tensor,
+    acquisition: Acquisition,
+    provenance: dict[str, Any],
+    field: Tensor | None = None,
+    *,
+    even_light: bool = False,
 ) -> Generator[str, None, Bundle]:
     """Calibrate the bundle from one image of it (H, W) in [0, 1]; yields the name of each step that is done.
 
-    In even light the image is the transmission; otherwise its slow changes are divided out of it.
+    In even light the image is the transmission; otherwise its slow changes are divided out of it. Outside the field
+    (H, W), by default all of the image, there is no bundle.
     """
+    field = torch.ones_like(mean, dtype=torch.bool) if field is None else field
     told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": _version()}
     gain_weight = 1.0 if even_light else 0.0
-    pitch = find_pitch(mean)
+    pitch = find_pitch(mean, field)
     yield "pitch found"
+    inner = without_rim(field)
+    plain = _blocks(torch.ones_like(mean), inner, acquisition, pattern="none", black=0.0, provenance=told)
     if pitch is None:
-        return _blocks(torch.ones_like(mean), acquisition, pattern="none", black=0.0, provenance=told)
-    black = float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
-    light = (mean - black).clamp_min(0)
+        return plain
+    black = _black_level(mean, pitch, field)
+    # The outermost cores shine beyond the field.
+    reached = widened(field, pitch)
+    light = (mean - black).clamp_min(0) * reached
     envelope = local_mean(light, _ENVELOPE * pitch)
-    outline = envelope > _DARK * torch.quantile(thinned(envelope), 0.95)
+    outline = (envelope > _DARK * torch.quantile(thinned(envelope), 0.95)) & reached
     envelope = local_mean(light, _ENVELOPE * pitch, outline.to(light)).clamp_min(1e-6)
     flat = torch.where(outline, light / envelope, torch.zeros_like(light))
     passed = light if even_light else flat
     if pitch < LEAST_RESOLVED_PITCH:
-        return _blocks(passed, acquisition, pattern="unresolved", black=black, gain_weight=gain_weight, provenance=told)
+        return _blocks(
+            passed, inner, acquisition, pattern="unresolved", black=black, gain_weight=gain_weight, provenance=told
+        )
     centres = find_cores(flat, pitch, outline)
     yield "cores found"
     if len(centres) < _LEAST_CORES:
-        return _blocks(torch.ones_like(mean), acquisition, pattern="none", black=0.0, provenance=told)
+        return plain
     # Points are single precision, as all that is computed from them.
     centres = centres.astype(np.float32).astype(np.float64)
     labels = nearest_core(centres.astype(np.float32), outline.cpu().numpy(), REACH * pitch)
@@ -135,14 +149,6 @@ def calibrating_mean(
         provenance=told,
     )
     return with_transmission(draft, passed)
-
-
-def exposed(frames: Tensor) -> Tensor:
-    """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
-    deviation = frames.std(dim=(1, 2))
-    bright = (frames >= SATURATED).float().mean(dim=(1, 2))
-    good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
-    return good if bool(good.any()) else torch.ones_like(good)
 
 
 def with_transmission(bundle: Bundle, transmission: Tensor) -> Bundle:
@@ -193,7 +199,8 @@ def remark(bundle: Bundle) -> str:
 
 def plain_frames(shape: tuple[int, int], acquisition: Acquisition) -> Bundle:
     """Return what stands for the bundle before it has been calibrated: every pixel passes all light."""
-    return _blocks(torch.ones(shape), acquisition, pattern="none", black=0.0, provenance={"source": "none"})
+    even = torch.ones(shape)
+    return _blocks(even, even > 0, acquisition, pattern="none", black=0.0, provenance={"source": "none"})
 
 
 def in_units(value: float, acquisition: Acquisition) -> float:
@@ -219,8 +226,20 @@ def _version() -> str:
         return "unknown"
 
 
+def _black_level(mean: Tensor, pitch: float, field: Tensor) -> float:
+    """Return the intensity without light in a mean frame (H, W), full scale 1.
+
+    A bundle is black between its cores and about its field. A faint one that fills the frame shows no black at all: its
+    darkest place is as bright as the object there, so the black level of the recording has to do.
+    """
+    if bool(field.all()) and is_faint(mean, pitch, field):
+        return 0.0
+    return float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
+
+
 def _blocks(
     transmission: Tensor,
+    field: Tensor,
     acquisition: Acquisition,
     *,
     pattern: Literal["unresolved", "none"],
@@ -228,30 +247,33 @@ def _blocks(
     provenance: dict[str, Any],
     gain_weight: float = 0.0,
 ) -> Bundle:
-    """Return a bundle whose cores are square blocks of pixels."""
+    """Return a bundle whose cores are square blocks of the field's pixels."""
     height, width = transmission.shape
+    outline = field.cpu().numpy()
     columns = -(-width // _BLOCK)
-    y, x = np.indices((height, width))
-    labels = (y // _BLOCK) * columns + x // _BLOCK
-    count = int(labels.max()) + 1
-    size = np.bincount(labels.ravel(), minlength=count)
+    y, x = np.nonzero(outline)
+    shown, labels = np.unique((y // _BLOCK) * columns + x // _BLOCK, return_inverse=True)
+    count = len(shown)
+    size = np.bincount(labels, minlength=count)
     # Single precision, as all that is computed from points.
-    centres = [(np.bincount(labels.ravel(), part.ravel(), count) / size).astype(np.float32) for part in (x, y)]
+    centres = [(np.bincount(labels, part, count) / size).astype(np.float32) for part in (x, y)]
     if pattern != "none":
-        transmission = transmission / bright_level(transmission)
+        transmission = transmission / bright_level(transmission[field])
+    block = np.full((height, width), count, dtype=np.int32)
+    block[outline] = labels
     return Bundle(
         pattern=pattern,
         pitch=float(_BLOCK),
         radius=_BLOCK / np.pi**0.5,
         centres=np.stack(centres, axis=1).astype(np.float64),
-        labels=labels.astype(np.int32),
-        transmission=transmission.cpu().numpy(),
+        labels=block,
+        transmission=torch.where(field, transmission, torch.zeros_like(transmission)).cpu().numpy(),
         gains=np.ones((count, 1), np.float32),
         gain_weights=np.full(count, gain_weight, np.float32),
         offsets=np.zeros((count, 1), np.float32),
         black=in_units(black, acquisition),
         dead=np.empty((0, 2)),
         saturated=np.zeros(count, dtype=bool),
-        outline=np.ones((height, width), dtype=bool),
+        outline=outline,
         provenance=provenance,
     )

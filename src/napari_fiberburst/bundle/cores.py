@@ -26,6 +26,9 @@ _PROFILE_PIXELS = 20_000
 # outside the bundle has blobs too.
 _LEAST_BLOB = 0.06
 _LEAST_LIGHT = 0.15
+# Bundles whose blobs are usually (median, of either sign) fainter than this, in the same parts, are faint: their cores
+# are the blobs stronger than this part of a usual one.
+_FAINT, _LEAST_OF_USUAL = 0.03, 0.3
 
 
 def find_cores(image: Tensor, pitch: float, outline: Tensor) -> NDArray[np.float64]:
@@ -42,9 +45,10 @@ def find_cores(image: Tensor, pitch: float, outline: Tensor) -> NDArray[np.float
     outline : Tensor
         (H, W) bool, where the bundle is.
     """
-    blob = blur(image, max(0.4, _INNER * pitch)) - blur(image, max(0.55, _OUTER * pitch))
-    around = local_mean(image, 0.7 * pitch)
-    is_core = (blob == _extreme(blob, round(0.2 * pitch))) & (blob > _LEAST_BLOB * around)
+    blob, around = _blobs(image, pitch)
+    usual = _usual_blob(image, pitch, outline)
+    least = _LEAST_BLOB if usual >= _FAINT else _LEAST_OF_USUAL * usual
+    is_core = (blob == _extreme(blob, round(0.2 * pitch))) & (blob > least * around)
     is_core &= outline & (around > _LEAST_LIGHT)
     peaks = is_core.nonzero().flip(1).cpu().numpy().astype(np.float64)
     if len(peaks) == 0:
@@ -112,6 +116,18 @@ def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitc
     if not light.any():
         return 0.36 * pitch
     return float(pitch * math.sqrt(2 * (light * radius**3).sum() / (light * radius).sum()))
+
+
+def _blobs(image: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
+    """Return how strong a blob each pixel is, and the light about it, (H, W)."""
+    blob = blur(image, max(0.4, _INNER * pitch)) - blur(image, max(0.55, _OUTER * pitch))
+    return blob, local_mean(image, 0.7 * pitch)
+
+
+def _usual_blob(image: Tensor, pitch: float, outline: Tensor) -> float:
+    """Return how strong blobs, bright or dark, usually are in parts of the light about them."""
+    blob, around = (part[outline] for part in _blobs(image, pitch))
+    return float((blob.abs() / around.clamp_min(1e-6)).median()) if len(blob) else 0.0
 
 
 def _extreme(image: Tensor, reach: int) -> Tensor:

@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.bundle.calibrate import exposed
 from napari_fiberburst.bundle.cores import find_cores
+from napari_fiberburst.bundle.samples import exposed
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import BundleError

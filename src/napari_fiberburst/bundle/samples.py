@@ -21,6 +21,8 @@ from napari_fiberburst.stored import Stored
 _LEAST_TRANSMISSION = 0.2
 # From this intensity on, full scale 1, a pixel is taken as saturated.
 SATURATED = 0.998
+# Frames that vary less than this part of the median frame are black, white or empty in another way.
+_LEAST_CONTRAST_OF_USUAL = 0.2
 # A core counts at most as much as this many typical ones, and not at all below this part of one.
 _MOST_WEIGHT, _LEAST_WEIGHT = 3.0, 0.02
 # Part of the detail predicted inside cores that must be there to count as real.
@@ -144,6 +146,14 @@ class BundleTensors:
         return values if values.shape[1] in (1, channels) else values.mean(dim=1, keepdim=True)
 
 
+def exposed(frames: Tensor) -> Tensor:
+    """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
+    deviation = frames.std(dim=(1, 2))
+    bright = (frames >= SATURATED).float().mean(dim=(1, 2))
+    good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
+    return good if bool(good.any()) else torch.ones_like(good)
+
+
 def sample(
     burst: Burst, bundle: Bundle, kind: Literal["cores", "pixels"] = "cores", *, device: str = "auto"
 ) -> Samples:
@@ -164,7 +174,8 @@ def sample(
     Returns
     -------
     Samples
-        With all frames in it; `register` finds those that do not belong.
+        With all frames in it, those without weight that are black, white or even; `register` finds others that do not
+        belong.
     """
     frames = torch.from_numpy(burst.frames).to(find_device(device))
     return (sample_pixels if kind == "pixels" else sample_cores)(frames, bundle, burst)
@@ -173,14 +184,15 @@ def sample(
 def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Samples:
     """Reduce frames (T, H, W, C) to one value a core: the least-squares amplitude of its profile.
 
-    Saturated pixels are left out of it.
+    Saturated pixels are left out of it, and so are frames that show nothing.
     """
     known = BundleTensors.of(bundle, acquisition, frames.device)
     count, channels = len(known.centres), frames.shape[-1]
     labels, profile = known.labels[known.own], known.transmission[known.own]
     values = torch.zeros(len(frames), count, channels).to(frames)
     power = torch.zeros(len(frames), count).to(frames)
-    for number, frame in enumerate(frames):
+    for number in exposed(frames.mean(dim=3)).nonzero()[:, 0].tolist():
+        frame = frames[number]
         light = frame[known.own]
         usable = profile * (light.amax(dim=1) < SATURATED)
         values[number].index_add_(0, labels, (light - known.black) * usable[:, None])
@@ -205,7 +217,10 @@ def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Sa
 
 
 def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Samples:
-    """Take every lit pixel of frames (T, H, W, C) as a sample of one point of the scene."""
+    """Take every lit pixel of frames (T, H, W, C) as a sample of one point of the scene.
+
+    Saturated pixels have no weight, nor have frames that show nothing.
+    """
     known = BundleTensors.of(bundle, acquisition, frames.device)
     lit = known.own & (known.transmission > _LEAST_TRANSMISSION)
     passed, labels = known.transmission[lit], known.labels[lit]
@@ -215,7 +230,7 @@ def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> S
         kind="pixels",
         positions=lit.nonzero().flip(1).to(frames.dtype),
         values=((light - known.black) / passed[:, None] - offsets) / gains,
-        weights=passed**2 * (light.amax(dim=2) < SATURATED),
+        weights=passed**2 * ((light.amax(dim=2) < SATURATED) & exposed(frames.mean(dim=3))[:, None]),
         core_index=labels,
         cores=len(known.centres),
         radius=None,
