@@ -41,6 +41,18 @@ class Noise:
         """Return the variance of pixels that show this light."""
         return self.shot * light.clamp_min(0) + self.read
 
+    def of_samples(self, bundle: Bundle, acquisition: Acquisition, samples: Samples) -> Tensor:
+        """Return the variance of samples of whole cores as they were taken, averaged over their channels, (T, N)."""
+        known = BundleTensors.of(bundle, acquisition, samples.values.device)
+        count = len(known.centres)
+        profile, labels = known.transmission[known.own], known.labels[known.own]
+        power, third = (
+            torch.zeros(count).to(profile).index_add_(0, labels, profile**order).clamp_min(1e-9) for order in (2, 3)
+        )
+        gains, offsets = (known.per_channel(part, 1)[:, 0] for part in (known.gains, known.offsets))
+        light = samples.grey * gains + offsets
+        return (self.shot * light.clamp_min(0) * third + self.read * power) / (power * gains) ** 2
+
 
 def measure_noise(grey: Tensor, bundle: Bundle, acquisition: Acquisition, samples: Samples) -> Noise | None:
     """Measure the noise of grey frames (T, H, W) by the pixels of resolved cores; None where there are too few.

@@ -5,6 +5,7 @@ it can stop between any two steps and still have something to draw.
 """
 
 import logging
+import math
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 
@@ -16,16 +17,18 @@ from torch import Tensor
 from napari_fiberburst.bundle import transmission
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
+from napari_fiberburst.bundle.noise import measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.motion.registration import Registration, refining, registering, unregistered
+from napari_fiberburst.motion.registration import MOST_UNEXPLAINED, Registration, refining, registering, unregistered
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
 from napari_fiberburst.settings import SplineMethod
 
@@ -185,6 +188,7 @@ class Stages:
             samples,
             dof=self._method.motion.dof,
             bends=self._method.motion.bends,
+            noise=self._noise_of(fitted, samples),
             iterations=self._method.iterations,
             seed=self._seed,
         )
@@ -205,10 +209,20 @@ class Stages:
         yield fitted
         return fitted
 
+    def _noise_of(self, fitted: Fitted, samples: Samples) -> float:
+        """Return the standard deviation that noise gives to a typical sample of a core, full scale 1; 0 if unknown."""
+        noise = measure_noise(self._grey, fitted.bundle, self._burst, samples)
+        if noise is None:
+            return 0.0
+        variance = noise.of_samples(fitted.bundle, self._burst, samples)
+        return math.sqrt(float(variance[samples.weights > 0].median()))
+
     def _is_start_in_doubt(self, fitted: Fitted) -> bool:
-        """Whether the mean frame may show the object rather than the gains, because the object hardly moves."""
-        bundle, travel = fitted.bundle, fitted.registration.travel
-        return bundle.is_resolved and not bundle.gains_known and travel < _SHORT_TRAVEL * bundle.pitch
+        """Whether the mean frame may have shown the object for gains: it hardly moves, or is not explained."""
+        bundle, found = fitted.bundle, fitted.registration
+        if not bundle.is_resolved or bundle.gains_known:
+            return False
+        return found.travel < _SHORT_TRAVEL * bundle.pitch or found.unexplained > MOST_UNEXPLAINED
 
     def _from_equal_gains(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Register once more from equal gains, and keep that start whose samples predict one another better."""
@@ -234,9 +248,12 @@ class Stages:
 
     def _refine(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
+        outliers = self._outliers(fitted)
         bundle, registration = remeasured(fitted.bundle, fitted.registration, self._grey, self._burst)
         observe = sample_pixels if self._kind(bundle, registration) == "pixels" else sample_cores
         samples = observe(self._frames, bundle, self._burst)
+        if outliers is not None:
+            samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples)
         steps = refining(
             samples,
@@ -251,6 +268,18 @@ class Stages:
                 yield fitted
             except StopIteration as end:
                 return replace(fitted, registration=end.value)
+
+    def _outliers(self, fitted: Fitted) -> Tensor | None:
+        """Return which cores show something else in which frames, (T, N), so far as that is clear; None if none do."""
+        registration = fitted.registration
+        if registration.is_still:
+            return None
+        samples = sample_cores(self._grey[..., None], fitted.bundle, self._burst)
+        spacing = max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch)
+        scene = solve_quickly(samples, registration, self._grid(spacing, fitted), self._method.smoothness)
+        points = registration.points(samples.positions)
+        outliers = find_outliers(scene.samples, points, scene.grid, scene.filtered)
+        return outliers if bool(outliers.any()) else None
 
     def _kind(self, bundle: Bundle, registration: Registration) -> str:
         """Return whether cores or pixels are the samples: as asked for, or as the burst itself shows."""

@@ -13,6 +13,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.gains import GainChange, refine_gains
+from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
 from napari_fiberburst.scene.spline import NormalEquations, assemble
@@ -22,6 +23,8 @@ from napari_fiberburst.stored import Stored
 # Iterations of conjugate gradients for a scene on the way, from an even one.
 _DRAFT_ITERATIONS = 25
 PREVIEW_ITERATIONS = 12
+# Outliers are looked for so many times: in the first scene, they are in the scene too.
+_OUTLIER_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -40,6 +43,8 @@ class Scene(Stored):
         That it was solved from, their gains taken out.
     gains : GainChange
         That were taken out of the samples on the way.
+    outliers : Tensor or None
+        (T, N) bool, samples that show something else, and have no weight; None where they have not been looked for.
     is_draft : bool
         Whether its smoothness is a usual one that has not been chosen yet.
     resolution : float or None
@@ -55,6 +60,7 @@ class Scene(Stored):
     equations: NormalEquations
     samples: Samples
     gains: GainChange
+    outliers: Tensor | None = None
     is_draft: bool = True
     resolution: float | None = None
     held_out_rmse: float | None = None
@@ -152,7 +158,8 @@ def solving(
     scene = _draft(samples, points, grid, smoothness, _DRAFT_ITERATIONS)
     if not registration.is_still:
         samples, gains = refine_gains(samples, points, grid, scene.filtered)
-        scene = replace(scene, samples=samples, gains=gains)
+        scene = _without_outliers(replace(scene, samples=samples, gains=gains), points, smoothness)
+        samples = scene.samples
     yield scene
     chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
     scene = replace(scene, resolution=chosen.resolution)
@@ -181,6 +188,20 @@ def _draft(samples: Samples, points: Tensor, grid: Grid, smoothness: float | Non
     weight = UNTOLD if smoothness is None else smoothness
     coefficients = equations.solve(weight, equations.mean(), iterations)
     return Scene(coefficients=coefficients, smoothness=weight, equations=equations, samples=samples, gains=GainChange())
+
+
+def _without_outliers(scene: Scene, points: Tensor, smoothness: float | None) -> Scene:
+    """Return the scene without samples that show something else, which are looked for again once the first are out."""
+    samples = scene.samples
+    outliers = torch.zeros_like(samples.weights, dtype=torch.bool)
+    for _ in range(_OUTLIER_ROUNDS):
+        outliers = find_outliers(samples, points, scene.grid, scene.filtered)
+        if not bool(outliers.any()):
+            break
+        left = replace(samples, weights=samples.weights * ~outliers)
+        draft = _draft(left, points, scene.grid, smoothness, _DRAFT_ITERATIONS)
+        scene = replace(draft, gains=scene.gains)
+    return replace(scene, outliers=outliers)
 
 
 def _choose(scene: Scene, points: Tensor, registration: Registration) -> Smoothness:

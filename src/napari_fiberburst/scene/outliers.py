@@ -1,0 +1,78 @@
+"""Samples that show something else than the object: what passes before it, a reflection, dirt on the camera."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.operators.grid import Grid, Sampling
+from napari_fiberburst.scene.prediction import predict
+
+# In standard deviations of the residuals as they usually are there: what is farther off is something else. Where that
+# is found, what lies about it by the second number, within the third in pitches, belongs to it.
+_FAR, _ALSO, _ABOUT = 7.0, 2.5, 2.0
+# In parts of the contrast of the samples.
+_LEAST_SIZE = 0.4
+# The median of the size of a normal variable of standard deviation 1.
+_MEDIAN_SIZE = 0.6745
+
+
+def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> Tensor:
+    """Return which samples show something else than the scene, (T, N) bool.
+
+    Something else covers several cores, so residuals are averaged over neighbours of a frame, which noise and wrong
+    gains do not survive. They are held against what is usual for all samples, for those of the frame and, where the
+    scene has edges, for those of other frames at the same place; and against the contrast of the scene, because the
+    sharpest frames of a burst that is mostly blurred differ from the others by right.
+
+    Parameters
+    ----------
+    samples : Samples
+        Gains and exposures taken out.
+    points : Tensor
+        (T, N, 2), where they lie in the scene.
+    grid : Grid
+        Of the scene.
+    filtered : Tensor
+        (C, H, W), the scene as samples see it through their footprint.
+    """
+    height, width = samples.shape
+    in_frame = Grid.over((0, 0, width - 1, height - 1), samples.pitch).at(samples.positions)
+    off, weights = torch.zeros_like(samples.weights), torch.zeros_like(samples.weights)
+    for frame, values, light, weight in predict(samples, points, grid, filtered):
+        off[frame] = _smooth(in_frame, (values - light).mean(dim=1), weight)
+        weights[frame] = weight
+    size, counted = off.abs(), weights > 0
+    if not bool(counted.any()):
+        return counted
+    usual = size[counted].median() / _MEDIAN_SIZE
+    # A frame that is blurred, or registered badly, is off everywhere.
+    of_frame = torch.where(counted, size, torch.nan).nanmedian(dim=1, keepdim=True).values.nan_to_num() / _MEDIAN_SIZE
+    coarse = Grid.around(points[counted], samples.pitch, 2 * samples.pitch).at(points)
+    # The mean size, as a normal variable's standard deviation; capped, so that outliers do not make themselves usual.
+    there = _smooth(coarse, size.clamp(max=float(3 * usual)), weights) * math.sqrt(math.pi / 2)
+    score = size / torch.maximum(torch.maximum(usual, of_frame), there).clamp_min(1e-12)
+    far = (score > _FAR) & (size > _LEAST_SIZE * _contrast(samples)) & counted
+    if not bool(far.any()):
+        return far
+    also = torch.zeros_like(far)
+    nodes = max(1.0, _ABOUT)
+    for frame in far.any(dim=1).nonzero().flatten().tolist():
+        near = in_frame(blur(in_frame.adjoint(far[frame].to(off)), nodes)) > 0.02
+        also[frame] = near & (score[frame] > _ALSO) & counted[frame]
+    return far | also
+
+
+def _contrast(samples: Samples) -> Tensor:
+    """Return the standard deviation of the samples."""
+    mass = samples.weights.sum().clamp_min(1e-9)
+    mean = (samples.weights * samples.grey).sum() / mass
+    return ((samples.weights * (samples.grey - mean).square()).sum() / mass).sqrt()
+
+
+def _smooth(at: Sampling, values: Tensor, weights: Tensor) -> Tensor:
+    """Return the local mean of scattered values, at their own places."""
+    total, mass = blur(torch.stack([at.adjoint(values * weights), at.adjoint(weights)]), 1.0)
+    return at(total / mass.clamp_min(1e-9)) * (at(mass) > 0)
