@@ -15,7 +15,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from napari_fiberburst.motion.models import FrameMotion
-from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.operators.filters import blur, local_mean
 from napari_fiberburst.operators.grid import Grid
 
 # Images for the coarse search have at most this many pixels a side.
@@ -26,6 +26,9 @@ _LEAST_OVERLAP = 0.12
 _ALL_PAIRS = 20
 _NEIGHBOURS = 3
 _LANDMARKS = 8
+# Brightness and contrast of the images are evened out over so many of their pixels (sigma of a Gaussian), contrast
+# where it is more than this part of the usual one.
+_NEIGHBOURHOOD, _LEAST_CONTRAST = 6.0, 0.5
 # Images that are this little alike do not show the same thing.
 LEAST_CONFIDENCE = 0.3
 
@@ -119,7 +122,22 @@ def _images(
     light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
     mass = blur(torch.stack([at.adjoint(w) for w in weights]), sigma)
     mask = mass > 0.2 * mass.mean()
-    return torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask
+    return _normalised(torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask), mask
+
+
+def _normalised(images: Tensor, mask: Tensor) -> Tensor:
+    """Return images (T, h, w) brought to one mean and contrast about every pixel.
+
+    What is bright, large and unlike the object, such as a reflection, would otherwise decide where a frame lies.
+    """
+    weight = mask.to(images)
+    mean, square = (
+        torch.stack([local_mean(image, _NEIGHBOURHOOD, own) for image, own in zip(part, weight, strict=True)])
+        for part in (images, images.square())
+    )
+    contrast = (square - mean.square()).clamp_min(0).sqrt()
+    usual = contrast[mask].median() if bool(mask.any()) else contrast.new_tensor(1.0)
+    return (images - mean) * weight / (contrast + _LEAST_CONTRAST * usual).clamp_min(1e-9)
 
 
 def _pairs(count: int) -> Iterator[tuple[int, int]]:

@@ -220,7 +220,7 @@ class Stages:
     def _is_start_in_doubt(self, fitted: Fitted) -> bool:
         """Whether the mean frame may have shown the object for gains: it hardly moves, or is not explained."""
         bundle, found = fitted.bundle, fitted.registration
-        if not bundle.is_resolved or bundle.gains_known:
+        if not bundle.is_resolved or bundle.gains_known or found.is_still or self._method.iterations is not None:
             return False
         return found.travel < _SHORT_TRAVEL * bundle.pitch or found.unexplained > MOST_UNEXPLAINED
 
@@ -229,8 +229,14 @@ class Stages:
         bundle = with_even_gains(fitted.bundle)
         samples = sample_cores(self._grey[..., None], bundle, self._burst)
         again = replace(fitted, bundle=bundle, registration=unregistered(samples), scene=None, image=None)
-        again = yield from self._register(again, samples)
-        return again if self._error(again) < self._error(fitted) else fitted
+        steps = self._register(again, samples)
+        while True:
+            try:
+                next(steps)
+                yield fitted  # whoever stops now gets the first start, which is complete
+            except StopIteration as end:
+                again = end.value
+                return again if self._error(again) < self._error(fitted) else fitted
 
     def _error(self, fitted: Fitted) -> float:
         """Return by how much samples that are left out are missed, relative to their mean light."""
