@@ -139,7 +139,7 @@ def check(checkout: Path) -> None:
 
 
 def find(names: Sequence[str] | None, *, is_quick: bool) -> dict[str, Case]:
-    """Return cases by TABLE:NAME; where there are no names, all but those of recorded faults, which another may not bear.
+    """Return cases by TABLE:NAME; without names, all but those of recorded faults, which another may not bear.
 
     Raises
     ------

@@ -181,6 +181,8 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         held_out_rmse=provenance.get("held_out_rmse"),
         frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
         confidence=_per_frame(provenance, "confidence"),
+        quality=provenance.get("quality"),
+        misfit=provenance.get("misfit"),
         exposures=_per_frame(provenance, "exposures"),
         resolution=provenance.get("resolution"),
         notes=tuple(provenance.get("notes", ())),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.noise import Noise
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.bundle.transmission import with_gains
 from napari_fiberburst.data.burst import Acquisition
@@ -16,6 +17,7 @@ from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.pipeline.verdict import collect, judge
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
 from napari_fiberburst.scene.prediction import predict
@@ -38,6 +40,7 @@ def diagnose(
     canvas: Canvas | None = None,
     *,
     notes: tuple[str, ...] = (),
+    noise: Noise | None = None,
     is_scene_shown: bool = True,
 ) -> Diagnostics:
     """Return what is known of a reconstruction beside its image.
@@ -56,6 +59,9 @@ def diagnose(
         Of the image; by default the field of the reference frame, pixel for pixel.
     notes : tuple of str
         What is known to be wrong already.
+    noise : Noise, optional
+        Of the camera, by `napari_fiberburst.bundle.noise.measure_noise`; without, errors are taken with the noise that
+        is in them.
     is_scene_shown : bool
         Whether the image shows this scene; where a network shows it instead, what holds for the scene alone
         (uncertainty, residuals, held-out error) is left open.
@@ -76,6 +82,7 @@ def diagnose(
         exposures=np.where(registration.used, registration.exposures, np.nan).astype(np.float64),
         reference=registration.reference,
         notes=notes,
+        outliers=None if scene.outliers is None else _per_core(scene.outliers, samples),
     )
     if not is_scene_shown:
         return found
@@ -83,13 +90,39 @@ def diagnose(
     most = max(float(scene.coefficients.std()), 1e-6)
     std = scene.equations.posterior_std(scene.smoothness, variance, most, max(1.0, bundle.radius))
     expected = scene.grid.at(_places(canvas, std))(std)
+    evidence = collect(scene, registration, _variance(noise, bundle, acquisition, registration, samples))
+    verdict = judge(evidence, registration, bundle.pitch, gains_known=bundle.gains_known)
     return replace(
         found,
+        quality=verdict.quality,
+        misfit=evidence.misfit if math.isfinite(evidence.misfit) else None,
+        notes=(*notes, *verdict.reasons),
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
         residuals=(residuals * span).cpu().numpy().astype(np.float32),
         held_out_rmse=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
         resolution=scene.resolution,
     )
+
+
+def _variance(
+    noise: Noise | None, bundle: Bundle, acquisition: Acquisition, registration: Registration, samples: Samples
+) -> Tensor | None:
+    """Return the noise's variance of one channel of samples as they were solved, (T, N); None where unknown."""
+    if noise is None or samples.kind != "cores":
+        return None
+    exposures, gains = (
+        torch.from_numpy(part).to(samples.values) for part in (registration.exposures, registration.gains)
+    )
+    factors = exposures[:, None] * gains[samples.core_index]
+    taken = replace(samples, values=samples.grey[..., None] * factors[..., None])
+    return samples.values.shape[2] * noise.of_samples(bundle, acquisition, taken) / factors**2
+
+
+def _per_core(outliers: Tensor, samples: Samples) -> NDArray[np.bool_]:
+    """Return which cores have an outlier among their samples, (T, G) bool."""
+    counts = torch.zeros(len(outliers), samples.cores).index_add_(1, samples.core_index.cpu(), outliers.cpu().float())
+    array: NDArray[np.bool_] = (counts > 0).numpy()
+    return array
 
 
 def _held_to_others(

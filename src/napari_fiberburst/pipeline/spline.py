@@ -77,7 +77,13 @@ class SplineFit:
         assert image is not None
         assert scene is not None
         diagnostics = diagnose(
-            self._burst, fitted.bundle, fitted.registration, scene, fitted.canvas, notes=fitted.all_notes
+            self._burst,
+            fitted.bundle,
+            fitted.registration,
+            scene,
+            fitted.canvas,
+            notes=fitted.all_notes,
+            noise=fitted.noise,
         )
         return Reconstruction(
             image=draw(image, fitted.canvas, fitted.registration.reference, self._burst),

@@ -17,7 +17,7 @@ from torch import Tensor
 from napari_fiberburst.bundle import transmission
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
-from napari_fiberburst.bundle.noise import measure_noise
+from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
@@ -64,6 +64,8 @@ class Fitted:
         The latest image; it knows by itself how the frames lay when it was made.
     notes : tuple of str
         What a user should know, beside the notes of the registration.
+    noise : Noise or None
+        Of the camera; None where it cannot be told, or not yet.
     """
 
     bundle: Bundle
@@ -73,6 +75,7 @@ class Fitted:
     scene: Scene | None = None
     image: SplineImage | None = None
     notes: tuple[str, ...] = ()
+    noise: Noise | None = None
 
     @property
     def all_notes(self) -> tuple[str, ...]:
@@ -119,7 +122,10 @@ class Stages:
         """Calibrate and register; None until the bundle is known."""
         bundle, notes = yield from self._calibrate()
         samples = sample_cores(self._grey[..., None], bundle, self._burst)
-        fitted = Fitted(bundle=bundle, registration=unregistered(samples), canvas=self._frame_canvas(), notes=notes)
+        noise = measure_noise(self._grey, bundle, self._burst, samples)
+        fitted = Fitted(
+            bundle=bundle, registration=unregistered(samples), canvas=self._frame_canvas(), notes=notes, noise=noise
+        )
         yield fitted
         fitted = yield from self._register(fitted, samples)
         if self._is_start_in_doubt(fitted):
@@ -188,7 +194,7 @@ class Stages:
             samples,
             dof=self._method.motion.dof,
             bends=self._method.motion.bends,
-            noise=self._noise_of(fitted, samples),
+            noise=_typical_noise(fitted, self._burst, samples),
             iterations=self._method.iterations,
             seed=self._seed,
         )
@@ -208,14 +214,6 @@ class Stages:
         fitted = self._sketched(fitted)
         yield fitted
         return fitted
-
-    def _noise_of(self, fitted: Fitted, samples: Samples) -> float:
-        """Return the standard deviation that noise gives to a typical sample of a core, full scale 1; 0 if unknown."""
-        noise = measure_noise(self._grey, fitted.bundle, self._burst, samples)
-        if noise is None:
-            return 0.0
-        variance = noise.of_samples(fitted.bundle, self._burst, samples)
-        return math.sqrt(float(variance[samples.weights > 0].median()))
 
     def _is_start_in_doubt(self, fitted: Fitted) -> bool:
         """Whether the mean frame may have shown the object for gains: it hardly moves, or is not explained."""
@@ -337,6 +335,14 @@ class Stages:
         first = canvas.reference_from_image[:2, 2]
         last = first + canvas.reference_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
         return grid_over((*first.tolist(), *last.tolist()), spacing, fitted.bundle.pitch + fitted.bundle.radius)
+
+
+def _typical_noise(fitted: Fitted, acquisition: Acquisition, samples: Samples) -> float:
+    """Return the standard deviation that noise gives to a typical grey sample, full scale 1; 0 where unknown."""
+    if fitted.noise is None:
+        return 0.0
+    variance = fitted.noise.of_samples(fitted.bundle, acquisition, samples)
+    return math.sqrt(float(variance[samples.weights > 0].median()))
 
 
 def remeasured(

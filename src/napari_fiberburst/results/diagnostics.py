@@ -1,12 +1,14 @@
 """What an image rests on: what was measured, how well, and what was filled in."""
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napari_fiberburst.bundle.bundle import Bundle
+
+Quality = Literal["good", "doubtful", "bad"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,6 +34,14 @@ class Diagnostics:
     residuals : numpy.ndarray or None
         (T, N) float32, root mean square by which the model misses each core in each frame, intensity units; NaN
         where there is no sample.
+    outliers : numpy.ndarray or None
+        (T, N) bool, cores that show something else than the object in a frame, and were left out there.
+    quality : str or None
+        "good"; "doubtful", where the image is worse than such a burst should give; "bad", where it does not show the
+        object. The reasons are in `notes`. None where it has not been judged.
+    misfit : float or None
+        Root mean square of what the model leaves of the samples, in standard deviations of the camera's noise, which is
+        measured in the burst: 1 for a perfect model (the root of the reduced chi-square).
     exposures : numpy.ndarray or None
         (T,) float64, brightness of each frame relative to the others, taken out of the image; their geometric mean is
         1. NaN for frames that do not take part.
@@ -55,6 +65,9 @@ class Diagnostics:
     gain_ratios: NDArray[np.float32] | None = None
     gain_weights: NDArray[np.float32] | None = None
     residuals: NDArray[np.float32] | None = None
+    outliers: NDArray[np.bool_] | None = None
+    quality: Quality | None = None
+    misfit: float | None = None
     exposures: NDArray[np.float64] | None = None
     held_out_rmse: float | None = None
     frames_used: tuple[int, ...] | None = None
@@ -67,6 +80,9 @@ class Diagnostics:
         """Return what is not an image, as plain values that JSON can hold."""
         bundle = self.bundle
         return {
+            "quality": self.quality,
+            "misfit": self.misfit,
+            "outliers": None if self.outliers is None else int(self.outliers.sum()),
             "held_out_rmse": self.held_out_rmse,
             "frames_used": self.frames_used,
             "confidence": _plain(self.confidence),
