@@ -96,6 +96,8 @@ def run(options: argparse.Namespace) -> int:
         print(f"two halves of the burst agree down to periods of {result.resolution:.1f} pixels")
     if result.compression > 0:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
+    if result.quality is not None:
+        print(f"the image is {result.quality}{'' if result.quality == 'good' else ': ' + '; '.join(result.notes)}")
     print(f"wrote {options.output}")
     if options.keep_bundle is not None:
         _keep(options.keep_bundle, result, known)

@@ -18,8 +18,11 @@ from napari_fiberburst.plugin.runs import KeptRun
 from napari_fiberburst.plugin.sections import section
 
 if TYPE_CHECKING:
+    from napari_fiberburst.results.diagnostics import Quality
     from napari_fiberburst.results.progress import Progress
 
+# Of a verdict; they are told apart by their words too.
+_COLOURS = {"good": "#3fa34d", "doubtful": "#d9822b", "bad": "#d64545"}
 # Per cent of an animation's own pace.
 _SLOW, _USUAL = 4, 100
 _NOTHING_YET = "Choose a burst and press Start."
@@ -95,7 +98,7 @@ class Display(QObject):
         self._draw_curves()
         self._points = None
         notes = f"; {len(result.notes)} notes, see Runs" if result.notes else ""
-        self.status.setText(f"{run.name}: {result.ending} in {result.seconds:.1f} s{notes}")
+        self.status.setText(f"{run.name}: {_verdict(result.quality)}{result.ending} in {result.seconds:.1f} s{notes}")
         self._layers_to_come = chain(
             self._layers_to_come, run.layers.finish(result, run.source.frames), self._say_complete(run)
         )
@@ -197,3 +200,8 @@ def _status(report: "Progress") -> str:
     if report.loss == report.loss:  # not NaN, as before the frames are registered
         parts.append(f"loss {report.loss:.3g}")
     return " · ".join(parts)
+
+
+def _verdict(quality: "Quality | None") -> str:
+    """Return the verdict as a coloured word, for a label that knows HTML."""
+    return "" if quality is None else f'<b style="color: {_COLOURS[quality]}">{quality}</b>, '

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from napari.components import ViewerModel
-from napari.layers import Image, Layer, Shapes, Tracks
+from napari.layers import Image, Layer, Shapes, Tracks, Vectors
 from numpy.typing import NDArray
 
-from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
-from napari_fiberburst.plugin.stacks import residual_maps, stabilised
+from napari_fiberburst.plugin.stacks import Flow, bending, moved_points, residual_maps, stabilised
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
@@ -25,6 +24,10 @@ _SECONDS_BETWEEN_OUTLINES = 5.0
 _OUTLINES_SHARE = 0.05
 _OUTLINES, _CENTRES = "frame outlines", "frame centres"
 _EDGE, _TRACK_COLOURS = "#ffb000", "turbo"
+# Outlines of frames that bend have so many points a side; arrows that show how, so many along the frame's longer side,
+# and are so much longer than the way they show.
+_PER_SIDE, _ARROWS, _ENLARGED = 12, 16, 3.0
+_ARROWS_NAME = "bending"
 # An outline is as wide as this part of the frame.
 _FRAME_PER_EDGE = 200
 # Above this one, residuals are shown in the brightest colour.
@@ -116,9 +119,10 @@ class RunLayers:
             # napari keeps layers of shapes that have been removed: what is large goes with the image alone.
             layer.metadata = self._metadata({"reconstruction": result} if _is_image(kind) else {})
         yield
-        yield from self._put_frames(result.homographies, shape)
+        flow = result.displacement if result.bends else None
+        yield from self._put_frames(result.homographies, shape, flow)
         if self._has_time:
-            still = stabilised(frames, result.homographies, canvas)
+            still = stabilised(frames, result.homographies, canvas, flow)
             if self.placement.rgb:
                 self._add("stabilised burst", still, "TYX", canvas, rgb=True)
             else:
@@ -137,6 +141,10 @@ class RunLayers:
             maps = residual_maps(result.residuals, bundle.labels)
             high = float(np.nanpercentile(result.residuals, _RESIDUAL_PERCENTILE))
             self._add("residuals", maps, "TYX", colormap="inferno", contrast_limits=(0.0, high or 1.0))
+        if result.outliers is not None and bundle.is_resolved and result.outliers.any():
+            yield
+            maps = residual_maps(result.outliers.astype(np.float32), bundle.labels)
+            self._add("left out", maps, "TYX", colormap="magenta", contrast_limits=(0.0, 1.0))
 
     def tell(self, name: str, value: Any) -> None:
         """Write something more into the metadata of all layers of the run."""
@@ -198,13 +206,10 @@ class RunLayers:
         layer.contrast_limits = limits
         self._limits[kind] = tuple(layer.contrast_limits)
 
-    def _vertices(
-        self, homography: NDArray[np.float64], points: NDArray[np.float64], frame: int
-    ) -> list[NDArray[np.float64]]:
-        return self.placement.vertices(transform_points(homography, points), frame)
-
-    def _put_frames(self, homographies: NDArray[np.float64], shape: tuple[int, int]) -> Iterator[None]:
-        """Add or change the outlines, then the track; yields after each."""
+    def _put_frames(
+        self, homographies: NDArray[np.float64], shape: tuple[int, int], flow: Flow | None = None
+    ) -> Iterator[None]:
+        """Add or change the outlines, then the track, then arrows where frames bend; yields after each."""
         height, width = shape
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
         centre = corners.mean(axis=0, keepdims=True)
@@ -213,7 +218,15 @@ class RunLayers:
         self._common["homographies"] = homographies
         if not (known and self._has_time):
             return
-        outlines = [one for frame in known for one in self._vertices(homographies[frame], corners, frame)]
+        flows = {frame: None if flow is None else flow(frame) for frame in known}
+        sides = (
+            corners if flow is None else np.linspace(corners, np.roll(corners, -1, axis=0), _PER_SIDE, axis=1)[:, :-1]
+        )
+
+        def vertices(points: NDArray[np.float64], frame: int) -> list[NDArray[np.float64]]:
+            return self.placement.vertices(moved_points(points, homographies[frame], flows[frame]), frame)
+
+        outlines = [one for frame in known for one in vertices(sides.reshape(-1, 2), frame)]
         if _OUTLINES not in self._layers:
             edge = {"edge_color": _EDGE, "edge_width": max(1.0, width / _FRAME_PER_EDGE), "face_color": "transparent"}
             self._insert(_OUTLINES, Shapes(outlines, shape_type="polygon", **edge, **placed))
@@ -221,7 +234,7 @@ class RunLayers:
             self._layers[_OUTLINES].data = outlines
         yield
         # One track for each position of axes that are neither time nor space.
-        tracks = zip(*(self._vertices(homographies[frame], centre, frame) for frame in known), strict=True)
+        tracks = zip(*(vertices(centre, frame) for frame in known), strict=True)
         points = np.array([[number, *point[0]] for number, track in enumerate(tracks) for point in track])
         if _CENTRES not in self._layers:
             tail = {"tail_length": len(homographies), "colormap": _TRACK_COLOURS}
@@ -229,6 +242,18 @@ class RunLayers:
         elif self._has(self._layers[_CENTRES]):
             self._layers[_CENTRES].data = points
         yield
+        if flow is not None:
+            self._put_arrows({frame: bending(flow(frame), homographies[frame], _ARROWS) for frame in known}, placed)
+            yield
+
+    def _put_arrows(self, arrows: Mapping[int, NDArray[np.float64]], placed: dict[str, Any]) -> None:
+        """Add a hidden layer of arrows (N, 2, 2) for every frame: where it bends, and by how much, enlarged."""
+        parts = []
+        for frame, pairs in arrows.items():
+            starts, ends = (self.placement.vertices(points, frame) for points in (pairs[:, 0], pairs.sum(axis=1)))
+            parts += [np.stack([start, end - start], axis=1) for start, end in zip(starts, ends, strict=True)]
+        look = {"length": _ENLARGED, "edge_color": _EDGE, "vector_style": "arrow", "visible": False}
+        self._insert(_ARROWS_NAME, Vectors(np.concatenate(parts), **look, **placed))
 
     def _add(self, kind: str, array: Any, axes: str, canvas: "Canvas | None" = None, **look: Any) -> None:
         """Add a hidden layer beneath the image for something that comes with the result, where it came."""

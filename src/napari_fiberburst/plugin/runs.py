@@ -83,7 +83,8 @@ class KeptRun:
         if result is None:
             return ""
         used = "" if result.frames_used is None else f", {len(result.frames_used)} of {len(result.homographies)} frames"
-        lines = [f"{result.ending} in {result.seconds:.1f} s on {result.device}{used}"]
+        verdict = "" if result.quality is None else f"{result.quality}; "
+        lines = [f"{verdict}{result.ending} in {result.seconds:.1f} s on {result.device}{used}"]
         if result.resolution is not None:
             size, unit = result.acquisition.pixel_size, result.acquisition.unit
             length = "" if size is None else f" = {result.resolution * sum(size) / 2:.3g} {unit}"

@@ -1,5 +1,6 @@
 """Stacks of one image a frame that are only made for the frame that is shown."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import dask.array as da
@@ -14,7 +15,14 @@ if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
 
 
-def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas") -> da.Array:
+# Fixed-point iterations that find the pixel of a bent frame that shows a place.
+_INVERSIONS = 8
+
+# Frame number to (H, W, 2): what takes each of its pixels to the reference frame's.
+Flow = Callable[[int], NDArray[np.float64]]
+
+
+def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas", flow: Flow | None = None) -> da.Array:
     """Return the frames as they came, moved onto the canvas: the object stands still, the honeycomb moves.
 
     Parameters
@@ -25,6 +33,8 @@ def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas")
         (T, 3, 3), frame-t pixel to frame-0 pixel; a frame with NaN becomes 0.
     canvas : Canvas
         Where to.
+    flow : callable, optional
+        Where frames bend beyond their homographies.
 
     Returns
     -------
@@ -33,7 +43,11 @@ def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas")
     """
     shape = (*canvas.shape, *frames.shape[3:])
     moved = [
-        da.from_delayed(delayed(_move)(frames[index], homography, canvas), shape, frames.dtype)
+        da.from_delayed(
+            delayed(_move)(frames[index], homography, canvas, None if flow is None else delayed(flow)(index)),
+            shape,
+            frames.dtype,
+        )
         for index, homography in enumerate(homographies)
     ]
     return da.stack(moved)
@@ -53,13 +67,52 @@ def residual_maps(residuals: NDArray[np.float32], labels: NDArray[np.int32]) -> 
     return da.stack(maps)
 
 
-def _move(frame: Any, homography: NDArray[np.float64], canvas: "Canvas") -> NDArray[Any]:
+def moved_points(
+    points: NDArray[np.float64], homography: NDArray[np.float64], flow: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Return where a frame's points (N, 2) lie in the reference frame's pixels."""
+    return transform_points(homography, points) if flow is None else points + _at(flow, points)
+
+
+def bending(flow: NDArray[np.float64], homography: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+    """Return by how much a frame bends beyond its homography, as arrows (N, 2, 2): from where, by how much; (x, y).
+
+    Parameters
+    ----------
+    flow : numpy.ndarray
+        (H, W, 2), frame pixel to reference pixel.
+    homography : numpy.ndarray
+        The same without bending.
+    steps : int
+        Arrows along the longer side.
+    """
+    height, width = flow.shape[:2]
+    step = max(height, width) / steps
+    y, x = np.mgrid[step / 2 : height : step, step / 2 : width : step]
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    places = moved_points(points, homography, flow)
+    return np.stack([places, places - transform_points(homography, points)], axis=1)
+
+
+def _at(flow: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    at = points[..., ::-1].reshape(-1, 2).T
+    parts = [map_coordinates(flow[..., axis], at, order=1, mode="nearest") for axis in (0, 1)]
+    return np.stack(parts, axis=-1).reshape(points.shape)
+
+
+def _move(
+    frame: Any, homography: NDArray[np.float64], canvas: "Canvas", flow: NDArray[np.float64] | None = None
+) -> NDArray[Any]:
     frame = np.asarray(frame)
     shape = (*canvas.shape, *frame.shape[2:])
     if not np.isfinite(homography).all():
         return np.zeros(shape, frame.dtype)
     points = canvas.points()
-    at = transform_points(np.linalg.inv(homography), points)[..., ::-1].transpose(2, 0, 1)
+    pixels = transform_points(np.linalg.inv(homography), points)
+    if flow is not None:
+        for _ in range(_INVERSIONS):
+            pixels = pixels - (pixels + _at(flow, pixels) - points)
+    at = pixels[..., ::-1].transpose(2, 0, 1)
     channels = frame.reshape(*frame.shape[:2], -1)
     moved = [map_coordinates(channel, at, order=1, output=frame.dtype) for channel in channels.transpose(2, 0, 1)]
     return np.stack(moved, axis=-1).reshape(shape)

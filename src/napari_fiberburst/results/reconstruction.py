@@ -180,6 +180,11 @@ class Reconstruction(Diagnostics):
         """
         return self.renderer.displacement(Canvas.over(self._field).points(), self._number(t))
 
+    @property
+    def bends(self) -> bool:
+        """Whether frames are moved by more than their homographies: then `displacement` has all of it."""
+        return self.settings.method.motion.bends is not False
+
     def provenance(self) -> dict[str, Any]:
         """Return where the image came from, as plain values that JSON can hold; None stands for NaN."""
         return {

@@ -146,6 +146,7 @@ class AutoMotion:
 class _MotionNetwork:
     # Behind a bundle the frames are registered by homographies before the network refines them.
     dof: ClassVar[int] = 8
+    bends: ClassVar[bool] = False
     motion_layers: int = parameter(3, "Hidden layers of the motion network.", least=1, most=64)
     motion_width: int = parameter(256, "Units per hidden layer of the motion network.", least=1, most=2**14)
 
@@ -165,6 +166,7 @@ class Flow(_MotionNetwork):
     """A displacement per pixel and frame, from a sine network: objects that deform."""
 
     name: ClassVar[str] = "flow"
+    bends: ClassVar[bool] = True
     flow_omega_0: float = parameter(
         30.0, "Frequency of the motion network's sine activations; more bends the flow more.", above=0, most=1e4
     )
