@@ -57,6 +57,11 @@ def find_pitch(image: Tensor) -> float | None:
     return pitch if best + 2 * (contrast - _USUAL_CONTRAST) > _LEAST_SIGN else None
 
 
+def ring_frequency(pitch: float) -> float:
+    """Return the radius of the ring that a lattice of this pitch draws in the spectrum, cycles per pixel."""
+    return _PITCH_PER_ROW / pitch
+
+
 def _radial_spectrum(image: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return frequencies, cycles per pixel, and the mean power at each, with the image's slow changes divided out."""
     height, width = image.shape
