@@ -95,10 +95,10 @@ def brightest(transmission: Tensor, labels: Tensor, count: int, pitch: float) ->
 def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitch: float) -> float:
     """Return the radius, in pixels, of the disc with the variance of the mean core's profile to the power of 1.5.
 
-    A core gathers light over the area through which it emits it, and less at its rim. Profiles of neighbours overlap, so
-    the mean profile is unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for all
-    cores (least squares, not negative). Its second moment is taken as far as it is a core's own; farther out lies stray
-    light.
+    A core gathers light over the area through which it emits it, and less at its rim. Profiles of neighbours overlap,
+    so the mean profile is unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for
+    all cores (least squares, not negative). Its second moment is taken as far as it is a core's own; farther out lies
+    stray light.
     """
     gains = brightest(transmission, labels, len(centres), pitch).cpu().numpy()
     y, x = np.nonzero((labels < len(centres)).cpu().numpy())
