@@ -24,7 +24,7 @@ from napari_fiberburst.operators.filters import blur
 # Pixels, how far the bundle may have moved since the frames before.
 MOST_OFFSET = 4
 # A bundle is looked for in so many frames, evenly taken, and must be seen in most of them.
-_PITCH_FRAMES = 5
+_PITCH_FRAMES = 3
 # Pixels to a side of the middle of the frames that is looked at; it holds hundreds of cores.
 _MOST_SIDE = 160
 # In pitches: over this much the slow changes of a frame are divided out; and the part of the usual light that a place
