@@ -57,3 +57,16 @@ def test_a_displacement_has_a_size():
     even = torch.zeros(2, 2, grid.shape[0] * grid.shape[1])
     even[1, 0], even[1, 1] = 3.0, -4.0
     torch.testing.assert_close(Displacement(grid, even).size(SHAPE), torch.tensor([0.0, 5.0]))
+
+
+def test_a_displacement_moves_with_its_points():
+    grid = ControlGrid.over((97, 121), 20.0)
+    y, x = torch.meshgrid(*(torch.arange(count) * 20.0 - 20.0 for count in grid.shape), indexing="ij")
+    control = torch.stack([torch.sin(x / 40) + y / 50, torch.cos(y / 45)]).reshape(1, 2, -1).repeat(2, 1, 1)
+    bends = Displacement(grid, control)
+    offsets = torch.tensor([[2.5, -1.5], [0.0, 3.0]], dtype=torch.float64)
+    points = torch.tensor([[31.0, 42.0], [60.0, 55.0], [83.0, 37.0]])
+    moved = bends.moved(offsets)
+    for number, offset in enumerate(offsets):
+        there = moved.at(points + offset.float())[number]
+        torch.testing.assert_close(there, bends.at(points)[number], atol=0.02, rtol=0)

@@ -22,6 +22,12 @@ _INNER, _OUTER = 0.15, 0.3
 # within the second reach is a core's own. In pitches. So many pixels are plenty.
 _PROFILE_STEP, _PROFILE_REACH, _OWN_REACH = 0.1, 1.3, 0.7
 _PROFILE_PIXELS = 20_000
+# The camera blurs the profile, and a core gathers less through its rim than it shows there, so the profile is raised to
+# this power before its moment is taken. Profiles in flat fields of a real bundle shrink by a fifth, sharp ones by 7 %.
+# That gains 0.7 to 2.7 dB behind the former and costs nothing behind the latter, and in a real burst, frames left out
+# are predicted best at 0.7 to 0.85 of the plain radius. In simulated bursts neither samples nor frames left out can
+# choose it, because their error falls with every smaller radius.
+_MOMENT_POWER = 1.5
 # How strong a blob is a core, in parts of the light about it; and how much light there must be about it, because noise
 # outside the bundle has blobs too.
 _LEAST_BLOB = 0.06
@@ -91,11 +97,12 @@ def brightest(transmission: Tensor, labels: Tensor, count: int, pitch: float) ->
 
 
 def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitch: float) -> float:
-    """Return the radius, in pixels, of the disc with the variance of the mean core's profile.
+    """Return the radius, in pixels, of the disc with the variance of the mean core's profile to the power of 1.5.
 
-    A core gathers light over the area through which it emits it. Profiles of neighbours overlap, so the mean profile is
-    unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for all cores (least
-    squares, not negative). Its second moment is taken as far as it is a core's own; farther out lies stray light.
+    A core gathers light over the area through which it emits it, and less at its rim. Profiles of neighbours overlap,
+    so the mean profile is unmixed: every pixel is a sum of its neighbours' profiles, one function of the distance for
+    all cores (least squares, not negative). Its second moment is taken as far as it is a core's own; farther out lies
+    stray light.
     """
     gains = brightest(transmission, labels, len(centres), pitch).cpu().numpy()
     y, x = np.nonzero((labels < len(centres)).cpu().numpy())
@@ -112,7 +119,7 @@ def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitc
     np.add.at(design, (pixel, below + 1), gain * (place - below).clip(0, 1))
     profile, _ = nnls(design[:, :knots], transmission.cpu().numpy()[y, x].astype(np.float64))
     radius = np.linspace(0, _OWN_REACH, 200)
-    light = np.interp(radius, np.arange(knots) * _PROFILE_STEP, profile)
+    light = np.interp(radius, np.arange(knots) * _PROFILE_STEP, profile) ** _MOMENT_POWER
     if not light.any():
         return 0.36 * pitch
     return float(pitch * math.sqrt(2 * (light * radius**3).sum() / (light * radius).sum()))

@@ -63,6 +63,11 @@ def find_pitch(image: Tensor, field: Tensor | None = None) -> float | None:
     return pitch if is_bundle else None
 
 
+def ring_frequency(pitch: float) -> float:
+    """Return the radius of the ring that a lattice of this pitch draws in the spectrum, cycles per pixel."""
+    return _PITCH_PER_ROW / pitch
+
+
 def is_faint(image: Tensor, pitch: float, field: Tensor) -> bool:
     """Whether the space between cores is nearly as bright as they are, in the field of an image (H, W)."""
     return _contrast(image, pitch, field.to(image)) < _FAINT

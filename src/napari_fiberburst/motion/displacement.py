@@ -7,7 +7,9 @@ registration using free-form deformations", IEEE Transactions on Medical Imaging
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.ndimage import shift
 from torch import Tensor
 
 
@@ -136,6 +138,18 @@ class Displacement:
     def of_frame(self, number: int) -> "Displacement":
         """Return the displacement of one frame alone."""
         return Displacement(self.grid, self.control[number : number + 1])
+
+    def moved(self, offsets: Tensor) -> "Displacement":
+        """Return what bends every frame where its points are moved by its offset (T, 2), pixels.
+
+        Values of control points are interpolated linearly, which is exact enough where offsets are a small part of
+        their spacing. Beyond the frame, what its edge has goes on.
+        """
+        planes = self.control.cpu().numpy().reshape(-1, 2, *self.grid.shape)
+        steps = offsets.cpu().numpy() / self.grid.spacing
+        moved = [shift(plane, (0, y, x), order=1, mode="nearest") for plane, (x, y) in zip(planes, steps, strict=True)]
+        control = torch.from_numpy(np.stack(moved)).to(self.control).reshape(self.control.shape)
+        return Displacement(self.grid, control)
 
     def size(self, shape: tuple[int, int]) -> Tensor:
         """Return the root mean square over each frame (height, width), pixels (T,)."""

@@ -180,6 +180,19 @@ class Registration(Stored):
         """Frame pixels to scene pixels, as an operator on points."""
         return FrameMotion(torch.from_numpy(self.scene_from_frame), self.shape, self.displacement)
 
+    def as_recorded(self, offsets: NDArray[np.float64]) -> "Registration":
+        """Return the registration of the frames as they were before each was moved back by its offset.
+
+        Parameters
+        ----------
+        offsets : numpy.ndarray
+            (T, 2), pixels: what was at pixel x of a frame as registered had been recorded at x + offset. That of the
+            reference frame is 0.
+        """
+        moved = self.scene_from_frame @ FrameMotion.of_shifts(-offsets, self.shape).scene_from_frame.numpy()
+        displacement = None if self.displacement is None else self.displacement.moved(torch.from_numpy(offsets))
+        return replace(self, scene_from_frame=moved, displacement=displacement)
+
     def correct(self, samples: Samples) -> Samples:
         """Return samples at gains and exposures of 1, and weighed by how far each frame is to be trusted.
 

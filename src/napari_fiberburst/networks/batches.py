@@ -7,7 +7,9 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
@@ -107,6 +109,8 @@ class BundleStream:
         Part of the samples that is left out.
     seed : int
         Seed of the shuffles, and of what is left out.
+    offsets : numpy.ndarray, optional
+        (T, 2), pixels: how far from their positions the samples lie in each frame; by default nowhere.
 
     Attributes
     ----------
@@ -116,18 +120,22 @@ class BundleStream:
         Samples there are.
     """
 
-    def __init__(self, samples: Samples, held_out: float, seed: int) -> None:
+    def __init__(
+        self, samples: Samples, held_out: float, seed: int, offsets: NDArray[np.float64] | None = None
+    ) -> None:
         self._values = 2 * samples.values - 1
         self._weights = samples.weights
         device = samples.weights.device
         scale = torch.from_numpy(unit_from_pixel(samples.shape)).to(samples.positions)
-        offsets = torch.zeros(1, 2)
+        footprint = torch.zeros(1, 2)
         if samples.radius is not None:
             angle = torch.arange(6) * math.pi / 3
             ring = _RING * samples.radius * torch.stack([angle.cos(), angle.sin()], dim=1)
-            offsets = torch.cat([offsets, ring])
-        places = samples.positions[:, None] + offsets.to(samples.positions)
+            footprint = torch.cat([footprint, ring])
+        places = samples.positions[:, None] + footprint.to(samples.positions)
         self._places = places * torch.diagonal(scale)[:2] + scale[:2, 2]
+        moves = torch.zeros(len(samples.values), 2) if offsets is None else torch.from_numpy(offsets)
+        self._moves = moves.to(places) * torch.diagonal(scale)[:2]
         generator = torch.Generator().manual_seed(seed)
         chance = torch.rand(samples.weights.shape, generator=generator).to(device)
         usable = samples.weights > 0
@@ -160,7 +168,8 @@ class BundleStream:
 
     def _batch(self, indices: Tensor) -> Batch:
         frames, place = indices // len(self._places), indices % len(self._places)
-        return Batch(self._places[place], frames, self._values[frames, place], self._weights[frames, place])
+        points = self._places[place] + self._moves[frames][:, None]
+        return Batch(points, frames, self._values[frames, place], self._weights[frames, place])
 
 
 def shuffled(count: int, seed: int, epoch: int, device: torch.device) -> Tensor:

@@ -49,11 +49,14 @@ class BehindBundle:
         (T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are left out.
     held_out : float
         Part of the samples that is left out of the fit.
+    offsets : numpy.ndarray or None
+        (T, 2), pixels: how far from their positions the samples lie in each frame, where the bundle moves.
     """
 
     samples: Samples
     homographies: NDArray[np.float64]
     held_out: float
+    offsets: NDArray[np.float64] | None = None
 
 
 class Problem:
@@ -105,7 +108,7 @@ class Problem:
         if behind is None:
             self.samples = PixelStream(burst, device, seed)
         else:
-            self.samples = BundleStream(behind.samples, behind.held_out, seed)
+            self.samples = BundleStream(behind.samples, behind.held_out, seed, behind.offsets)
             self.batch = min(self.batch, self.samples.count)
             start = _unit_start(behind)
         self.learning_rate = method.learning_rate or _usual_rate(method)

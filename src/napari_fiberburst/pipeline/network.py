@@ -96,7 +96,12 @@ class NetworkFit:
         fitted = self._aligned.round_off()
         assert fitted.samples is not None
         samples = fitted.registration.correct(fitted.samples)
-        behind = BehindBundle(samples, fitted.registration.reference_from_frame, self._method.held_out)
+        behind = BehindBundle(
+            samples,
+            fitted.recorded.reference_from_frame,
+            self._method.held_out,
+            None if fitted.mount is None else fitted.mount.offsets,
+        )
         method = replace(self._method, samples=fitted.samples.kind)
         problem = Problem(
             self._burst, method, self._device, seed=self._requested.seed, initial=self._initial, behind=behind

@@ -88,7 +88,7 @@ class SplineFit:
         return Reconstruction(
             image=draw(image, fitted.canvas, fitted.registration.reference, self._burst),
             canvas=fitted.canvas,
-            homographies=fitted.registration.reference_from_frame,
+            homographies=fitted.recorded.reference_from_frame,
             losses=np.array(self._losses, dtype=np.float32),
             requested=self._requested,
             settings=self._chosen(fitted, is_last=True),
@@ -125,7 +125,7 @@ class SplineFit:
             step=step,
             planned=max(_PLANNED, step + 1),
             loss=self._losses[-1],
-            homographies=fitted.registration.reference_from_frame,
+            homographies=fitted.recorded.reference_from_frame,
             settings=self._chosen(fitted, is_last=is_last),
             canvas=fitted.canvas,
             draw=(lambda: draw(image, fitted.canvas, fitted.registration.reference, self._burst))

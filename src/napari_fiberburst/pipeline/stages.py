@@ -17,6 +17,7 @@ from torch import Tensor
 from napari_fiberburst.bundle import transmission
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
+from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
@@ -53,9 +54,11 @@ class Fitted:
     bundle : Bundle
         That samples are taken with; what gains are found beyond it is in the registration.
     registration : Registration
-        Of the frames.
+        Of the frames, with the bundle at rest.
     canvas : Canvas
         Where the image lies.
+    mount : Mount or None
+        Where the bundle is in the frames as they were recorded; None where it rests.
     samples : Samples or None
         The final samples, in all channels, as they were taken; None until it is known what a sample is.
     scene : Scene or None
@@ -71,11 +74,17 @@ class Fitted:
     bundle: Bundle
     registration: Registration
     canvas: Canvas
+    mount: Mount | None = None
     samples: Samples | None = None
     scene: Scene | None = None
     image: SplineImage | None = None
     notes: tuple[str, ...] = ()
     noise: Noise | None = None
+
+    @property
+    def recorded(self) -> Registration:
+        """The registration of the frames as they were recorded."""
+        return self.registration if self.mount is None else self.registration.as_recorded(self.mount.offsets)
 
     @property
     def all_notes(self) -> tuple[str, ...]:
@@ -120,17 +129,35 @@ class Stages:
 
     def align(self) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register; None until the bundle is known."""
+        mount = find_mount(self._grey)
+        fitted = yield from self._align_by(mount)
+        reference = fitted.registration.reference
+        if mount is not None and mount.offsets[reference].any():
+            # The image is in the pixels of the reference frame, so that is where the bundle has to rest.
+            fitted = yield from self._align_by(mount.relative_to(reference))
+        return (yield from self._refine(fitted))
+
+    def _align_by(self, mount: Mount | None) -> Generator[Fitted | None, None, Fitted]:
+        """Calibrate and register frames in which the bundle is brought to rest."""
+        steadied: tuple[str, ...] = ()
+        if mount is not None:
+            self._frames = mount.steadied(torch.from_numpy(self._burst.frames).to(self._frames))
+            self._grey = self._frames.mean(dim=3)
+            steadied = (_warned(mount.note),)
+        yield None
         bundle, notes = yield from self._calibrate()
-        samples = sample_cores(self._grey[..., None], bundle, self._burst)
-        noise = measure_noise(self._grey, bundle, self._burst, samples)
+        samples = _seen(sample_cores(self._grey[..., None], bundle, self._burst), mount)
         fitted = Fitted(
-            bundle=bundle, registration=unregistered(samples), canvas=self._frame_canvas(), notes=notes, noise=noise
+            bundle=bundle,
+            registration=unregistered(samples),
+            canvas=self._frame_canvas(),
+            mount=mount,
+            notes=(*steadied, *notes),
+            noise=measure_noise(self._grey, bundle, self._burst, samples),
         )
         yield fitted
         fitted = yield from self._register(fitted, samples)
-        if self._is_start_in_doubt(fitted):
-            fitted = yield from self._from_equal_gains(fitted)
-        return (yield from self._refine(fitted))
+        return (yield from self._from_equal_gains(fitted)) if self._is_start_in_doubt(fitted) else fitted
 
     def solve(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Solve the scene for the bundle and motion as they are."""
@@ -225,7 +252,7 @@ class Stages:
     def _from_equal_gains(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Register once more from equal gains, and keep that start whose samples predict one another better."""
         bundle = with_even_gains(fitted.bundle)
-        samples = sample_cores(self._grey[..., None], bundle, self._burst)
+        samples = _seen(sample_cores(self._grey[..., None], bundle, self._burst), fitted.mount)
         again = replace(fitted, bundle=bundle, registration=unregistered(samples), scene=None, image=None)
         steps = self._register(again, samples)
         while True:
@@ -238,7 +265,7 @@ class Stages:
 
     def _error(self, fitted: Fitted) -> float:
         """Return by how much samples that are left out are missed, relative to their mean light."""
-        samples = sample_cores(self._grey[..., None], fitted.bundle, self._burst)
+        samples = _seen(sample_cores(self._grey[..., None], fitted.bundle, self._burst), fitted.mount)
         grid = self._grid(max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch), fitted)
         return prediction_error(samples, fitted.registration, grid, seed=self._seed)
 
@@ -255,7 +282,7 @@ class Stages:
         outliers = self._outliers(fitted)
         bundle, registration = remeasured(fitted.bundle, fitted.registration, self._grey, self._burst)
         observe = sample_pixels if self._kind(bundle, registration) == "pixels" else sample_cores
-        samples = observe(self._frames, bundle, self._burst)
+        samples = _seen(observe(self._frames, bundle, self._burst), fitted.mount)
         if outliers is not None:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples)
@@ -278,7 +305,7 @@ class Stages:
         registration = fitted.registration
         if registration.is_still:
             return None
-        samples = sample_cores(self._grey[..., None], fitted.bundle, self._burst)
+        samples = _seen(sample_cores(self._grey[..., None], fitted.bundle, self._burst), fitted.mount)
         spacing = max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch)
         scene = solve_quickly(samples, registration, self._grid(spacing, fitted), self._method.smoothness)
         points = registration.points(samples.positions)
@@ -298,7 +325,9 @@ class Stages:
 
     def _in_colour(self, fitted: Fitted) -> Samples:
         """Return the final samples; before they are known, those of whole cores."""
-        return sample_cores(self._frames, fitted.bundle, self._burst) if fitted.samples is None else fitted.samples
+        if fitted.samples is not None:
+            return fitted.samples
+        return _seen(sample_cores(self._frames, fitted.bundle, self._burst), fitted.mount)
 
     def _sketched(self, fitted: Fitted) -> Fitted:
         """Solve a coarse image of all that is known so far."""
@@ -312,7 +341,7 @@ class Stages:
         """Return what is known with another scene, and the image that it stands for."""
         if fitted.scene is not None and scene.coefficients is fitted.scene.coefficients:
             return replace(fitted, scene=scene)
-        image = image_of(scene, fitted.registration, fitted.bundle, self._burst, fill=self._method.fill)
+        image = image_of(scene, fitted.recorded, fitted.bundle, self._burst, fill=self._method.fill)
         return replace(fitted, scene=scene, image=image)
 
     def _frame_canvas(self) -> Canvas:
@@ -437,6 +466,10 @@ def render(
     canvas = Canvas.over((0, 0, width, height)) if canvas is None else canvas
     image = image_of(scene, registration, bundle, acquisition, fill=fill)
     return draw(image, canvas, registration.reference, acquisition)
+
+
+def _seen(samples: Samples, mount: Mount | None) -> Samples:
+    return samples if mount is None else mount.seen(samples)
 
 
 def _warned(text: str) -> str:

@@ -139,8 +139,8 @@ def judge(evidence: Evidence, registration: Registration, pitch: float, *, gains
     if not registration.is_still and evidence.error > _DOUBTFUL_ERROR:
         is_bad = evidence.error > _BAD_ERROR
         reasons.append(
-            f"samples that were left out are missed by {100 * evidence.error:.0f} % of their contrast: the object moves "
-            "or changes in other ways than by the motion that was found"
+            f"samples that were left out are missed by {100 * evidence.error:.0f} % of their contrast: the object "
+            "moves or changes in other ways than by the motion that was found"
         )
     if evidence.structure > _STRUCTURE:
         reasons.append(

@@ -119,7 +119,7 @@ class RunLayers:
             # napari keeps layers of shapes that have been removed: what is large goes with the image alone.
             layer.metadata = self._metadata({"reconstruction": result} if _is_image(kind) else {})
         yield
-        flow = result.displacement if result.bends else None
+        flow = result.flow if result.bends else None
         yield from self._put_frames(result.homographies, shape, flow)
         if self._has_time:
             still = stabilised(frames, result.homographies, canvas, flow)

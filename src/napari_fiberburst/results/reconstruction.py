@@ -8,6 +8,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.io.results import is_representation, write_image, write_representation
@@ -180,9 +181,31 @@ class Reconstruction(Diagnostics):
         """
         return self.renderer.displacement(Canvas.over(self._field).points(), self._number(t))
 
+    def displacement(self, t: int) -> NDArray[np.float64]:
+        """How frame `t` bends beyond its homography.
+
+        Parameters
+        ----------
+        t : int
+            Frame number; negative ones count from the end.
+
+        Returns
+        -------
+        numpy.ndarray
+            (H, W, 2) as (x, y) in pixels of frame 0, at each of the frame's pixels: `flow` less what the homography
+            does; 0 where frames do not bend. NaN for a frame that does not take part.
+
+        Raises
+        ------
+        IndexError
+            There is no such frame.
+        """
+        points = Canvas.over(self._field).points()
+        return self.flow(t) + points - transform_points(self.homographies[self._number(t)], points)
+
     @property
     def bends(self) -> bool:
-        """Whether frames are moved by more than their homographies: then `displacement` has all of it."""
+        """Whether frames are moved by more than their homographies; `displacement` tells by how much."""
         return self.settings.method.motion.bends is not False
 
     def provenance(self) -> dict[str, Any]:
