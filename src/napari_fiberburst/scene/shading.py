@@ -13,7 +13,7 @@ can tell.
 
 How strongly curvature and slope of S, and the exposures, are held back is what makes the ratios most likely (MacKay,
 "Bayesian interpolation", Neural Computation 4(3), 1992). So a burst that tells nothing of the shading, because it is
-even or hardly moves, gets none.
+even or hardly moves, gets none; and neither does one whose shading might be chance.
 """
 
 from dataclasses import dataclass, replace
@@ -54,8 +54,10 @@ _USUAL_CURVATURE, _LEAST_CURVATURE = 0.1, 1e-4
 _LEAST_STRENGTH = 0.1
 # The constant of the shading, which nothing tells, is held by this.
 _RIDGE = 1e-4
+# In variances of the noise: by so much, and so much for each degree of freedom, a shading must reduce the squares.
+_LEAST_GAIN = (4.0, 2.0)
 # Shadings that are this even everywhere (ratio of the brightest to the darkest place, less 1) change nothing.
-_LEAST_SHADING = 0.01
+_LEAST_SHADING = 0.02
 # What the mean frame shows is smoothed by this weight of its curvature, for a core to each.
 _FRAME_CURVATURE = 1.0
 
@@ -114,7 +116,10 @@ def find_shading(samples: Samples, registration: Registration) -> Shading | None
         exposures=torch.ones(len(samples.values)).to(samples.values),
     )
     for _ in range(_ROUNDS):
-        found = found.times(_find_what_is_left(samples.without_gains(found.gains), found.exposed(registration)))
+        left = _find_what_is_left(samples.without_gains(found.gains), found.exposed(registration))
+        if left is None:
+            break
+        found = found.times(left)
     return found if found.is_noticeable else None
 
 
@@ -210,8 +215,8 @@ class _System:
     rhs: Array
 
 
-def _find_what_is_left(samples: Samples, registration: Registration) -> Shading:
-    """Find the shading by one scene."""
+def _find_what_is_left(samples: Samples, registration: Registration) -> Shading | None:
+    """Find the shading by one scene; None where it does not stand out of the noise."""
     ratios, basis = _compare(samples, registration), _Basis.over(samples)
     known = np.where(registration.used, np.log(registration.exposures.astype(np.float64)), 0.0)
     priors = _Priors.usual(basis, samples.values.shape[2], known)
@@ -226,6 +231,8 @@ def _find_what_is_left(samples: Samples, registration: Registration) -> Shading:
         sizes = torch.from_numpy(left * np.sqrt(ratios.weights))
         robust = huber(sizes, torch.from_numpy(ratios.weights)).numpy()
     frames = len(known)
+    if not priors.stands_out(system, solution):
+        return None
     return _shading(basis, solution[:-frames].reshape(-1, basis.splines.shape[1]), solution[-frames:], samples)
 
 
@@ -359,8 +366,7 @@ class _Channel:
         return sparse.csr_matrix(entries, shape=(len(self._mass()), int(columns.max()) + 1))
 
     def _sum_over_cells(self, values: Array) -> Array:
-        sums: Array = np.bincount(self.ratios.cells.ravel(), values.ravel())
-        return sums
+        return np.bincount(self.ratios.cells.ravel(), values.ravel()).astype(np.float64)
 
     def _mass(self) -> Array:
         return np.maximum(self._sum_over_cells(self.weights), 1e-12)
@@ -435,18 +441,34 @@ class _Priors:
         most = tuple(size**-2 for size in (_LEAST_CURVATURE, _LEAST_SLOPE, _LEAST_FLICKER))
         frames = len(self.known)
         offset = np.concatenate([np.zeros(len(system.rhs) - frames), self.known])
-        ridge = _RIDGE * np.eye(len(system.rhs))
         for _ in range(_STRENGTH_ROUNDS):
-            prior = sum(strength * part for strength, part in zip(strengths, self.matrices, strict=True))
-            covariance = np.linalg.inv(system.matrix + prior + ridge)
+            covariance = self._covariance(system, strengths)
             solution = covariance @ (system.rhs - strengths[-1] * offset)
             strengths = tuple(
-                float(
-                    np.clip((rank - strength * np.vdot(covariance, part)) / _energy(part, solution + offset), 0.1, top)
-                )
-                for rank, strength, part, top in zip(self.ranks, strengths, self.matrices, most, strict=True)
+                float(np.clip(told / _energy(part, solution + offset), _LEAST_STRENGTH, top))
+                for told, part, top in zip(self._told(covariance, strengths), self.matrices, most, strict=True)
             )
         return solution, replace(self, strengths=strengths)
+
+    def stands_out(self, system: _System, solution: Array) -> bool:
+        """Whether the shading makes the ratios more likely by more than its degrees of freedom would by chance."""
+        curvature, slope, _ = self._told(self._covariance(system, self.strengths), self.strengths)
+        shading = solution.copy()
+        shading[-len(self.known) :] = 0
+        gained = 2 * float(shading @ system.rhs) - float(shading @ system.matrix @ shading)
+        return gained > _LEAST_GAIN[0] + _LEAST_GAIN[1] * (curvature + slope)
+
+    def _covariance(self, system: _System, strengths: tuple[float, ...]) -> Array:
+        """Return the covariance of the solution under priors of these strengths."""
+        prior = sum(strength * part for strength, part in zip(strengths, self.matrices, strict=True))
+        return np.asarray(np.linalg.inv(system.matrix + prior + _RIDGE * np.eye(len(system.rhs))), dtype=np.float64)
+
+    def _told(self, covariance: Array, strengths: tuple[float, ...]) -> list[float]:
+        """Return how many degrees of freedom of each prior the data tell."""
+        return [
+            rank - strength * float(np.vdot(covariance, part))
+            for rank, strength, part in zip(self.ranks, strengths, self.matrices, strict=True)
+        ]
 
 
 def _energy(matrix: Array, values: Array) -> float:
