@@ -9,6 +9,7 @@ from napari_fiberburst import (
     Registration,
     calibrate,
     diagnose,
+    flatten,
     refine,
     register,
     remeasure,
@@ -39,12 +40,16 @@ samples = sample(burst, bundle)
 registration = refine(samples, registration)
 print(f"motion off by {motion_error(registration.reference_from_frame, simulated.homographies, shape):.3f} px")
 
+# 4. The light, where it is not even; samples by a bundle that knows it.
+bundle, registration = flatten(burst, bundle, registration)
+samples = sample(burst, bundle)
+
 # Whatever a step has come to can wait in a file: the scene may be solved elsewhere, or later.
 bundle.save(folder / "probe.bundle")
 registration.save(folder / "motion.safetensors")
 bundle, registration = Bundle.load(folder / "probe.bundle"), Registration.load(folder / "motion.safetensors")
 
-# 4. The scene, and what it rests on.
+# 5. The scene, and what it rests on.
 scene = solve(samples, registration)
 image = render(burst, bundle, registration, scene, fill=True)
 found = diagnose(burst, bundle, registration, scene)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
+    from napari_fiberburst.pipeline.stages import flatten as flatten
     from napari_fiberburst.pipeline.stages import remeasure as remeasure
     from napari_fiberburst.pipeline.stages import render as render
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
@@ -50,6 +51,7 @@ _HOMES = {
     "Settings": "settings",
     "calibrate": "bundle.calibrate",
     "diagnose": "pipeline.diagnose",
+    "flatten": "pipeline.stages",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
     "read_burst": "io",

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from napari_fiberburst import Burst, load, reconstruct
 from napari_fiberburst.errors import BundleError, SettingsError
 from napari_fiberburst.quality import motion_error, psnr, ssim
-from napari_fiberburst.simulation import Camera, simulate
+from napari_fiberburst.simulation import Camera, Faults, simulate
 
 SHAPE = (127, 141)
 
@@ -223,3 +223,36 @@ def test_a_calibration_image_may_be_a_file_and_is_cropped_along(cores, tmp_path)
 def test_bad_calls_are_refused(cores, choices, error, said):
     with pytest.raises(error, match=said):
         reconstruct(cores.burst, **choices)
+
+
+VIGNETTED = {"shape": SHAPE, "frames": 12, "pitch": 5.0, "physics": "core", "seed": 2}
+
+
+def test_a_threefold_vignette_is_taken_for_light_and_costs_little():
+    even, shaded = (simulate("histology", faults=Faults(vignette=strength), **VIGNETTED) for strength in (1, 3))
+    found, left = (reconstruct(shaded.burst, fill=True, flatten=flatten) for flatten in ("motion", "none"))
+    quality = psnr(found.image, shaded.truth[0])
+    assert quality > psnr(left.image, shaded.truth[0]) + 0.5
+    assert quality > psnr(reconstruct(even.burst, fill=True).image, even.truth[0]) - 0.7
+    # The vignette of the last channel is the strongest, and the bundle knows it.
+    seen = found.bundle.gains[:, 2] / found.bundle.gains[:, 0]
+    x, y = np.rint(found.bundle.centres).astype(int).T
+    shading = shaded.shading[y.clip(0, SHAPE[0] - 1), x.clip(0, SHAPE[1] - 1)]
+    assert np.corrcoef(np.log(seen), np.log(shading[:, 2] / shading[:, 0]))[0, 1] > 0.9
+
+
+def test_in_even_light_looking_for_shading_changes_nothing(cores, fitted):
+    result = reconstruct(cores.burst, flatten="none", fill=True)
+    np.testing.assert_array_equal(result.image, fitted.image)
+    np.testing.assert_array_equal(result.bundle.gains, fitted.bundle.gains)
+
+
+def test_without_motion_the_mean_frames_slow_changes_are_the_lights_where_that_is_asked_for():
+    shaded = simulate("cat", faults=Faults(vignette=3), motion=still_to(12), **VIGNETTED)
+    equal, falling = (reconstruct(shaded.burst, flatten=flatten).bundle for flatten in ("motion", "frame"))
+    distance = np.hypot(*(equal.centres - np.array(SHAPE[::-1]) / 2).T)
+    dimmer = [
+        bundle.brightness[distance > 60].mean() / bundle.brightness[distance < 40].mean() for bundle in (equal, falling)
+    ]
+    assert dimmer[0] > 0.9
+    assert dimmer[1] < 0.8

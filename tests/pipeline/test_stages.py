@@ -15,6 +15,7 @@ from napari_fiberburst import (
     Scene,
     calibrate,
     diagnose,
+    flatten,
     reconstruct,
     refine,
     register,
@@ -37,6 +38,8 @@ def stages(cores):
     bundle, registration = remeasure(cores.burst, bundle, registration)
     samples = sample(cores.burst, bundle)
     registration = refine(samples, registration)
+    bundle, registration = flatten(cores.burst, bundle, registration)
+    samples = sample(cores.burst, bundle)
     return bundle, samples, registration, solve(samples, registration)
 
 
@@ -110,6 +113,7 @@ def test_a_burst_that_stands_still_goes_through_the_steps(cores):
     assert registration.is_still
     assert refine(samples, registration) is registration
     assert remeasure(still, bundle, registration) == (bundle, registration)
+    assert flatten(still, bundle, registration) == (bundle, registration)
     image = render(still, bundle, registration, solve(samples, registration))
     assert np.isfinite(image).mean() > 0.9
 

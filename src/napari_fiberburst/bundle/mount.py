@@ -17,7 +17,7 @@ from scipy.ndimage import shift
 from torch import Tensor
 
 from napari_fiberburst.bundle.pitch import find_pitch, ring_frequency
-from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.bundle.samples import Samples, exposed
 from napari_fiberburst.operators.filters import blur
 
 # Pixels, how far the bundle may have moved since the frames before.

@@ -1,4 +1,4 @@
-"""The steps of the method as one flow of values: calibrate, sample, register, refine, solve.
+"""The steps of the method as one flow of values: calibrate, sample, register, refine, flatten, solve.
 
 Every function here is a generator that yields what is known so far and returns its last value, so that whoever drains
 it can stop between any two steps and still have something to draw.
@@ -30,6 +30,7 @@ from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.results.reconstruction import draw
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.scene.outliers import find_outliers
+from napari_fiberburst.scene.shading import Shading, find_shading, shading_of_frames
 from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
 from napari_fiberburst.settings import SplineMethod
 
@@ -135,7 +136,11 @@ class Stages:
         if mount is not None and mount.offsets[reference].any():
             # The image is in the pixels of the reference frame, so that is where the bundle has to rest.
             fitted = yield from self._align_by(mount.relative_to(reference))
-        return (yield from self._refine(fitted))
+        fitted = yield from self._refine(fitted)
+        if self._method.flatten == "motion":
+            fitted = self._flattened(fitted)
+            yield fitted
+        return fitted
 
     def _align_by(self, mount: Mount | None) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register frames in which the bundle is brought to rest."""
@@ -212,6 +217,7 @@ class Stages:
             bundle = placement.bundle
             if placement.note:
                 return bundle, (_warned(placement.note),)
+        bundle = self._flattened_by_frames(bundle)
         text = remark(bundle)
         return bundle, (_warned(text),) if text else ()
 
@@ -275,7 +281,28 @@ class Stages:
         if bundle.is_resolved and not bundle.gains_known and fitted.registration.used.sum() > 1:
             text = "the object moves too little to fill the gaps between cores; cores are taken as equally bright"
             fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
-        return replace(fitted, bundle=with_even_gains(bundle))
+        return replace(fitted, bundle=self._flattened_by_frames(with_even_gains(bundle)))
+
+    def _flattened_by_frames(self, bundle: Bundle) -> Bundle:
+        """Take the slow changes of the mean frame into a bundle of unknown gains, where that is asked for."""
+        if self._method.flatten != "frame" or bundle.gains_known:
+            return bundle
+        return _lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
+
+    def _flattened(self, fitted: Fitted) -> Fitted:
+        """Take the shading that the motion tells into bundle, samples and exposures."""
+        assert fitted.samples is not None
+        samples, registration = fitted.samples, fitted.registration
+        cores = samples if samples.kind == "cores" else sample_cores(self._frames, fitted.bundle, self._burst)
+        shading = find_shading(cores, registration)
+        if shading is None:
+            return fitted
+        return replace(
+            fitted,
+            bundle=_lit(fitted.bundle, shading),
+            samples=samples.without_gains(shading.gains),
+            registration=shading.exposed(registration),
+        )
 
     def _refine(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
@@ -417,6 +444,41 @@ def remeasure(
     """
     grey = torch.from_numpy(burst.frames).to(find_device(device)).mean(dim=3)
     return remeasured(bundle, registration, grey, burst)
+
+
+def flatten(
+    burst: Burst, bundle: Bundle, registration: Registration, *, device: str = "auto"
+) -> tuple[Bundle, Registration]:
+    """Take into a bundle how the illumination changes over the frame, as far as the object's motion tells it.
+
+    Parameters
+    ----------
+    burst : Burst
+        The frames.
+    bundle : Bundle
+        By `remeasure`. One whose gains are known already is returned as it is.
+    registration : Registration
+        By `refine`.
+    device : str
+        Where to compute.
+
+    Returns
+    -------
+    Bundle, Registration
+        The bundle, whose gains may differ between channels now, and the registration with the exposures that belong to
+        it; the same ones where the light is even, or the object moves too little to tell.
+    """
+    frames = torch.from_numpy(burst.frames).to(find_device(device))
+    shading = find_shading(sample_cores(frames, bundle, burst), registration)
+    if shading is None:
+        return bundle, registration
+    return _lit(bundle, shading), shading.exposed(registration)
+
+
+def _lit(bundle: Bundle, shading: Shading) -> Bundle:
+    """Return the bundle under this illumination."""
+    common = shading.gains.mean(dim=1)
+    return transmission.with_gains(bundle, common, shading.gains / common[:, None])
 
 
 def image_of(

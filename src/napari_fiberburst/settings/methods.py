@@ -48,6 +48,12 @@ class _BehindBundle(_Drawn):
         "What is taken as one sample behind the bundle: each core, each lit pixel, or, auto, what the burst itself "
         "shows.",
     )
+    flatten: Literal["motion", "frame", "none"] = parameter(
+        "motion",
+        "Which slow changes of brightness over the frame are the illumination's: those that the object's motion tells "
+        "from it, none where it tells nothing; all that the mean frame shows, for a strong vignette without motion; or "
+        "none. A bundle that is known is taken as it is.",
+    )
     canvas: Literal["frame", "union"] = parameter(
         "frame", "What the image covers: the first frame's field, or all that any frame saw."
     )
@@ -138,6 +144,7 @@ class NetworkMethod(_BehindBundle, _SceneNetwork):
         return SplineMethod(
             motion=Homography() if isinstance(self.motion, Flow) else self.motion,
             samples=self.samples,
+            flatten=self.flatten,
             canvas=self.canvas,
             upsample=self.upsample,
             fill=self.fill,
