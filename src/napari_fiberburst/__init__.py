@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
-    from napari_fiberburst.pipeline.stages import flatten as flatten
-    from napari_fiberburst.pipeline.stages import remeasure as remeasure
-    from napari_fiberburst.pipeline.stages import render as render
+    from napari_fiberburst.pipeline.remeasure import flatten as flatten
+    from napari_fiberburst.pipeline.remeasure import remeasure as remeasure
+    from napari_fiberburst.pipeline.render import render as render
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
     from napari_fiberburst.results.progress import Progress as Progress
     from napari_fiberburst.results.reconstruction import Reconstruction as Reconstruction
@@ -51,15 +51,15 @@ _HOMES = {
     "Settings": "settings",
     "calibrate": "bundle.calibrate",
     "diagnose": "pipeline.diagnose",
-    "flatten": "pipeline.stages",
+    "flatten": "pipeline.remeasure",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
     "refine": "motion.registration",
     "register": "motion.registration",
-    "remeasure": "pipeline.stages",
-    "render": "pipeline.stages",
+    "remeasure": "pipeline.remeasure",
+    "render": "pipeline.render",
     "sample": "bundle.samples",
     "solve": "scene.solve",
 }

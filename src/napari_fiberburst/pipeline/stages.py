@@ -11,10 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.bundle import transmission
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
 from napari_fiberburst.bundle.mount import Mount, find_mount
@@ -23,14 +21,14 @@ from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.motion.registration import MOST_UNEXPLAINED, Registration, refining, registering, unregistered
 from napari_fiberburst.operators.grid import Grid
-from napari_fiberburst.results.reconstruction import draw
+from napari_fiberburst.pipeline.remeasure import lit, remeasured
+from napari_fiberburst.pipeline.render import image_of
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.scene.outliers import find_outliers
-from napari_fiberburst.scene.shading import Shading, find_shading, shading_of_frames
+from napari_fiberburst.scene.shading import find_shading, shading_of_frames
 from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
 from napari_fiberburst.settings import SplineMethod
 
@@ -42,8 +40,6 @@ _PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
 _SHORT_TRAVEL = 1.0
 # A union of frames reaches at most so many frames' sizes from the reference frame.
 _MOST_FIELDS = 5
-# Nodes with less than this weight of samples have been seen by none.
-_LEAST_DENSITY = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -287,7 +283,7 @@ class Stages:
         """Take the slow changes of the mean frame into a bundle of unknown gains, where that is asked for."""
         if self._method.flatten != "frame" or bundle.gains_known:
             return bundle
-        return _lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
+        return lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
 
     def _flattened(self, fitted: Fitted) -> Fitted:
         """Take the shading that the motion tells into bundle, samples and exposures."""
@@ -299,7 +295,7 @@ class Stages:
             return fitted
         return replace(
             fitted,
-            bundle=_lit(fitted.bundle, shading),
+            bundle=lit(fitted.bundle, shading),
             samples=samples.without_gains(shading.gains),
             registration=shading.exposed(registration),
         )
@@ -399,135 +395,6 @@ def _typical_noise(fitted: Fitted, acquisition: Acquisition, samples: Samples) -
         return 0.0
     variance = fitted.noise.of_samples(fitted.bundle, acquisition, samples)
     return math.sqrt(float(variance[samples.weights > 0].median()))
-
-
-def remeasured(
-    bundle: Bundle, registration: Registration, grey: Tensor, acquisition: Acquisition
-) -> tuple[Bundle, Registration]:
-    """Return the bundle measured anew by grey frames (T, H, W) in [0, 1], and the registration without its gains.
-
-    The gains that were found on the way are in the transmission then. Where the object does not move, or the gains were
-    known, both are returned as they are.
-    """
-    if registration.is_still or bundle.gains_known:
-        return bundle, registration
-    used = np.flatnonzero(registration.used)
-    found = transmission.remeasure(
-        bundle,
-        grey[torch.from_numpy(registration.used)],
-        acquisition,
-        lambda number, pixels: registration.predicted(int(used[number]), pixels),
-    )
-    return found, replace(registration, gains=np.ones_like(registration.gains))
-
-
-def remeasure(
-    burst: Burst, bundle: Bundle, registration: Registration, *, device: str = "auto"
-) -> tuple[Bundle, Registration]:
-    """Measure the transmission of a bundle anew, once the frames are registered and the object is known.
-
-    Parameters
-    ----------
-    burst : Burst
-        That the bundle was calibrated from.
-    bundle : Bundle
-        By `calibrate`. One whose gains are known already is returned as it is.
-    registration : Registration
-        By `register`.
-    device : str
-        Where to compute.
-
-    Returns
-    -------
-    Bundle, Registration
-        The bundle, and the registration without the gains that are in the bundle now.
-    """
-    grey = torch.from_numpy(burst.frames).to(find_device(device)).mean(dim=3)
-    return remeasured(bundle, registration, grey, burst)
-
-
-def flatten(
-    burst: Burst, bundle: Bundle, registration: Registration, *, device: str = "auto"
-) -> tuple[Bundle, Registration]:
-    """Take into a bundle how the illumination changes over the frame, as far as the object's motion tells it.
-
-    Parameters
-    ----------
-    burst : Burst
-        The frames.
-    bundle : Bundle
-        By `remeasure`. One whose gains are known already is returned as it is.
-    registration : Registration
-        By `refine`.
-    device : str
-        Where to compute.
-
-    Returns
-    -------
-    Bundle, Registration
-        The bundle, whose gains may differ between channels now, and the registration with the exposures that belong to
-        it; the same ones where the light is even, or the object moves too little to tell.
-    """
-    frames = torch.from_numpy(burst.frames).to(find_device(device))
-    shading = find_shading(sample_cores(frames, bundle, burst), registration)
-    if shading is None:
-        return bundle, registration
-    return _lit(bundle, shading), shading.exposed(registration)
-
-
-def _lit(bundle: Bundle, shading: Shading) -> Bundle:
-    """Return the bundle under this illumination."""
-    common = shading.gains.mean(dim=1)
-    return transmission.with_gains(bundle, common, shading.gains / common[:, None])
-
-
-def image_of(
-    scene: Scene, registration: Registration, bundle: Bundle, acquisition: Acquisition, *, fill: bool
-) -> SplineImage:
-    """Return what can be drawn of a scene."""
-    return SplineImage(
-        scene=scene.image,
-        grid=scene.grid,
-        known=scene.equations.density() > _LEAST_DENSITY,
-        reach=bundle.pitch,
-        fill=fill,
-        homographies=registration.reference_from_frame,
-        motion=None if registration.displacement is None else registration.motion.cpu(),
-        black=(bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level),
-    )
-
-
-def render(
-    acquisition: Acquisition,
-    bundle: Bundle,
-    registration: Registration,
-    scene: Scene,
-    canvas: Canvas | None = None,
-    *,
-    fill: bool = False,
-) -> NDArray[np.float32]:
-    """Draw a scene in the intensity units of its burst.
-
-    Parameters
-    ----------
-    acquisition : Acquisition
-        Of the burst, or the burst itself.
-    bundle, registration, scene
-        That its samples were taken with, where they lie, and what they were solved for.
-    canvas : Canvas, optional
-        Of the image; by default the field of the reference frame, pixel for pixel.
-    fill : bool
-        Fill in the image where no core has looked, instead of leaving it empty (NaN).
-
-    Returns
-    -------
-    numpy.ndarray
-        (H, W) or (H, W, C) float32.
-    """
-    height, width = bundle.shape
-    canvas = Canvas.over((0, 0, width, height)) if canvas is None else canvas
-    image = image_of(scene, registration, bundle, acquisition, fill=fill)
-    return draw(image, canvas, registration.reference, acquisition)
 
 
 def _seen(samples: Samples, mount: Mount | None) -> Samples:
