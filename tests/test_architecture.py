@@ -23,7 +23,7 @@ ALLOWED = {
     "io": BASE,
     "simulation": BASE,
     "quality": BASE,
-    "results": BASE | {"io", "bundle"},
+    "results": BASE | {"io", "bundle", "coordinates"},
     "operators": BASE | {"coordinates"},
     "bundle": BASE | {"coordinates", "operators", "device", "steps", "stored", "io"},
     "motion": BASE | {"coordinates", "operators", "steps", "stored", "bundle"},

@@ -49,7 +49,7 @@ def test_a_loss_or_slower_fits_are_the_exit_status(quality, seconds, status, mon
 def test_cases_are_found_by_table_and_name():
     assert list(side_by_side.find(["3:by hand", "1"], is_quick=False))[:2] == ["3:by hand", "1:liver"]
     assert len(side_by_side.find(None, is_quick=True)) == 8
-    with pytest.raises(SettingsError, match="unknown case 'moon'; known: 1, 3, 5, 1:liver"):
+    with pytest.raises(SettingsError, match="unknown case 'moon'; known: 1, 3, 5, 6, 1:liver"):
         side_by_side.find(["moon"], is_quick=False)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from napari_fiberburst.networks.field import JointField
-from napari_fiberburst.settings import MOTIONS, choose
+from napari_fiberburst.settings import NETWORK_MOTIONS, choose
 
 
 def count(module):
@@ -36,7 +36,7 @@ def test_other_choices_have_the_sizes_of_their_equations(choices, motion, scene)
 
 
 @pytest.mark.parametrize("preset", ["auto", "paper"])
-@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("motion", NETWORK_MOTIONS)
 def test_every_motion_starts_at_the_identity(preset, motion):
     if motion not in choose(preset).motions or (preset, motion) == ("paper", "homography"):
         return

@@ -153,7 +153,7 @@ def test_motion_that_is_open_is_what_is_usual_with_the_method():
     assert choose(motion="auto").method.motion == AutoMotion()
     assert choose(motion="auto", encoding="fourier").method.motion == Homography()
     assert choose("paper", motion="auto").method.motion == HomographyNetwork()
-    with pytest.raises(SettingsError, match="unknown motion 'deformable'; known: none"):
+    with pytest.raises(SettingsError, match="needs encoding 'spline'; with a network, take motion 'flow'"):
         choose(motion="deformable", encoding="fourier")
 
 

@@ -17,10 +17,13 @@ from napari_fiberburst.results.diagnostics import Quality
 from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import Scene
 
-# Error of samples that were left out, without the noise, as a part of the samples' standard deviation.
+# Error of samples that were left out, without the noise, as a part of the samples' standard deviation. It is this many
+# times as large where the noise is not known, and is in it; and grows as frames get fewer than this, because their
+# samples leave gaps.
 _DOUBTFUL_ERROR, _BAD_ERROR = 0.11, 0.22
+_WITH_NOISE, _ENOUGH_FRAMES = 3.0, 8
 # Ratio of the residuals of blurred frames to those of sharp ones: upper to lower quartile.
-_UNEVEN_FRAMES = 2.2
+_UNEVEN_FRAMES = 1.5
 # Correlation of residuals of neighbouring cores.
 _STRUCTURE = 0.12
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
@@ -52,6 +55,11 @@ class Evidence:
     misfit: float
     frame_misfit: tuple[float, ...]
     structure: float
+
+    @property
+    def is_noise_known(self) -> bool:
+        """Whether the noise has been taken out of `error`."""
+        return bool(np.isfinite(self.misfit))
 
     @property
     def unevenness(self) -> float:
@@ -136,8 +144,9 @@ def judge(evidence: Evidence, registration: Registration, pitch: float, *, gains
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
-    if not registration.is_still and evidence.error > _DOUBTFUL_ERROR:
-        is_bad = evidence.error > _BAD_ERROR
+    allowed = (1.0 if evidence.is_noise_known else _WITH_NOISE) * max(1.0, _ENOUGH_FRAMES / max(1, used))
+    if not registration.is_still and evidence.error > _DOUBTFUL_ERROR * allowed:
+        is_bad = evidence.error > _BAD_ERROR * allowed
         reasons.append(
             f"samples that were left out are missed by {100 * evidence.error:.0f} % of their contrast: the object "
             "moves or changes in other ways than by the motion that was found"
@@ -151,9 +160,10 @@ def judge(evidence: Evidence, registration: Registration, pitch: float, *, gains
     if count > 1 and used < max(2, _LEAST_USED * count):
         is_bad = is_bad or used < 2
         reasons.append(f"only {used} of {count} frames could be registered")
-    elif 1 < count and used < _FEW_FRAMES:
-        reasons.append(f"{used} frames leave gaps, and tell little of the cores' gains")
-    if not gains_known and (registration.is_still or registration.travel < _SHORT_TRAVEL * pitch):
+    is_few = 1 < count and used < _FEW_FRAMES
+    if is_few and not gains_known:
+        reasons.append(f"{used} frames tell little of the cores' gains; a bundle that is known would tell them")
+    elif not gains_known and (registration.is_still or registration.travel < _SHORT_TRAVEL * pitch):
         reasons.append("the object moves too little to tell the cores' gains from its own light")
     quality: Quality = "bad" if is_bad else "doubtful" if reasons else "good"
     return Verdict(quality=quality, reasons=tuple(reasons))

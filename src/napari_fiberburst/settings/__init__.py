@@ -3,6 +3,7 @@
 from napari_fiberburst.settings.choices import (
     ENCODINGS,
     MOTIONS,
+    NETWORK_MOTIONS,
     PUBLISHED_MOTIONS,
     Affine,
     AutoMotion,
@@ -42,6 +43,7 @@ __all__ = [
     "ENCODING_NAMES",
     "METHODS",
     "MOTIONS",
+    "NETWORK_MOTIONS",
     "PRESETS",
     "PUBLISHED_MOTIONS",
     "Affine",

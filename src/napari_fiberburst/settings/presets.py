@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 from napari_fiberburst.errors import SettingsError
-from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, PUBLISHED_MOTIONS, AutoMotion
+from napari_fiberburst.settings.choices import ENCODINGS, MOTIONS, PUBLISHED_MOTIONS, AutoMotion, Deformable, Flow
 from napari_fiberburst.settings.keywords import ENCODING_NAMES, keywords_of
 from napari_fiberburst.settings.methods import METHODS, Method, NetworkMethod, PublishedMethod, SplineMethod
 from napari_fiberburst.settings.parameter import Parameter, parameters_of
@@ -44,6 +44,10 @@ def choose(preset: str | Settings = "auto", **choices: Any) -> Settings:
     kind = _kind_of(settings.method, observation, encoding)
     if kind is not SplineMethod and given.get("motion") == AutoMotion.name:
         del given["motion"]  # networks have one usual motion
+    if kind is not SplineMethod and given.get("motion") == Deformable.name:
+        raise SettingsError(
+            f"motion {Deformable.name} needs encoding {SplineMethod.name!r}; with a network, take motion {Flow.name!r}"
+        )
     values = _carried(settings.method, kind)
     values["motion"] = _turned(_part("motion", given.pop("motion", None), values["motion"], kind.motions), given)
     if "encoding" in values:
