@@ -19,6 +19,8 @@ _SMOOTHING, _SMOOTHING_PITCHES = 3.0, 0.4
 # A place is dark below this part of the light of a bright one, above black. The darkest place of an image without black
 # in it is not dark: what has more than the second part of a bright place's light, black level included, never is.
 _DARK, _DARK_WITH_BLACK = 0.04, 0.25
+# Surroundings are black: most of them are below this part of the light of a bright place, above the darkest.
+_BLACK = 0.012
 # Light changes where its standard deviation over time is at least this part of its upper quartile, both above that of
 # dark places, which is noise. It changes nowhere if the upper quartile is less than so many times the noise.
 _LEAST_CHANGE, _LEAST_OVER_NOISE = 1 / 6, 2.0
@@ -58,7 +60,7 @@ def find_field(frames: Tensor, pitch: float | None = None) -> Tensor:
     light = _smooth(frames.mean(dim=0), width)
     level = _dark_level(light)
     lit = light >= level
-    if _share(~lit) < _LEAST_SURROUNDINGS:
+    if _share(~lit) < _LEAST_SURROUNDINGS or not _is_black(light, ~lit):
         return everywhere
     changes = _changes(_smooth(frames.std(dim=0, correction=0), width), lit)
     parts = _large_parts(ndimage.binary_opening(lit & changes, _disc(_THIN)))
@@ -101,6 +103,12 @@ def _dark_level(light: NDArray[np.float32]) -> float:
     """Return the light below which a place is dark."""
     black, bright = np.quantile(light, [0.002, 0.95])
     return float(min(black + _DARK * (bright - black), _DARK_WITH_BLACK * bright))
+
+
+def _is_black(light: NDArray[np.float32], dark: NDArray[np.bool_]) -> bool:
+    """Return whether dark places are evenly black, rather than the end of a slow fall of the light."""
+    black, bright = np.quantile(light, [0.002, 0.95])
+    return _share(light[dark] < black + _BLACK * (bright - black)) > 0.5
 
 
 def _changes(change: NDArray[np.float32], lit: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -48,7 +48,7 @@ _MOST_SWELLING = 3.0
 _ENOUGH = 0.015
 # Frames may bend where their residuals ask for it by at least this score, and do where that leaves at most this part of
 # the residuals.
-_LEAST_BENDING_SCORE, _MOST_LEFT_BY_BENDING = 2.0, 0.9
+_LEAST_BENDING_SCORE, _MOST_LEFT_BY_BENDING = 3.0, 0.9
 # A registration that leaves more unexplained than this has failed, or the model is wrong. Of simulated bursts those
 # that are registered to some tenths of a pixel leave up to 0.2 without noise, and those that are not 0.26 and more.
 MOST_UNEXPLAINED = 0.22

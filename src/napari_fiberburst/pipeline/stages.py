@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 # Spacing of the first preview's nodes, pixels or, in coarse bundles, pitches.
 _PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
 # In pitches: where an object travels less (root mean square), registration starts from two places.
-_SHORT_TRAVEL = 1.0
+_SHORT_TRAVEL = 0.7
 # A union of frames reaches at most so many frames' sizes from the reference frame.
 _MOST_FIELDS = 5
 
@@ -325,14 +325,12 @@ class Stages:
 
     def _outliers(self, fitted: Fitted) -> Tensor | None:
         """Return which cores show something else in which frames, (T, N), so far as that is clear; None if none do."""
-        registration = fitted.registration
-        if registration.is_still:
+        registration, scene = fitted.registration, fitted.registration.scene
+        if registration.is_still or scene is None:
             return None
         samples = _seen(sample_cores(self._grey[..., None], fitted.bundle, self._burst), fitted.mount)
-        spacing = max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch)
-        scene = solve_quickly(samples, registration, self._grid(spacing, fitted), self._method.smoothness)
-        points = registration.points(samples.positions)
-        outliers = find_outliers(scene.samples, points, scene.grid, scene.filtered)
+        points = registration.motion.apply(samples.positions)
+        outliers = find_outliers(registration.correct(samples), points, scene.grid, scene.light * scene.nodes[None])
         return outliers if bool(outliers.any()) else None
 
     def _kind(self, bundle: Bundle, registration: Registration) -> str:

@@ -22,6 +22,8 @@ from napari_fiberburst.scene.solve import Scene
 # samples leave gaps.
 _DOUBTFUL_ERROR, _BAD_ERROR = 0.11, 0.22
 _WITH_NOISE, _ENOUGH_FRAMES = 3.0, 8
+# Cores' gains are not known better than to this part, so errors of this part of the light are to be expected.
+_GAIN_ERROR = 0.01
 # Ratio of the residuals of blurred frames to those of sharp ones: upper to lower quartile.
 _UNEVEN_FRAMES = 1.5
 # Correlation of residuals of neighbouring cores.
@@ -41,7 +43,8 @@ class Evidence:
     Attributes
     ----------
     error : float
-        Root mean square error of samples left out of the fit, without the noise, over the samples' standard deviation.
+        Root mean square error of samples left out of the fit, without the noise and what the gains' errors make of the
+        light, over the samples' standard deviation.
     misfit : float
         Root mean square of the residuals in standard deviations of the noise: 1 for a perfect model (the root of the
         reduced chi-square).
@@ -109,7 +112,8 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
     spread = ((mass * (grey - (mass * grey).sum() / total).square()).sum() / total).sqrt()
     noise = 0.0 if variance is None else float((mass * variance).sum() / total)
     held_out = float("nan") if scene.held_out_rmse is None else scene.held_out_rmse
-    error = max(held_out**2 - noise, 0.0) ** 0.5 / max(float(spread), 1e-9) if held_out == held_out else held_out
+    expected = noise + float((mass * (_GAIN_ERROR * grey) ** 2).sum() / total)
+    error = max(held_out**2 - expected, 0.0) ** 0.5 / max(float(spread), 1e-9) if held_out == held_out else held_out
     channels = samples.values.shape[2]
     scaled = off.square() * (1.0 if variance is None else channels / variance.clamp_min(1e-12))
     counts = known.sum(dim=1)

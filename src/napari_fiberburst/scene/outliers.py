@@ -15,6 +15,8 @@ from napari_fiberburst.scene.prediction import predict
 _FAR, _ALSO, _ABOUT = 7.0, 2.5, 2.0
 # In parts of the contrast of the samples.
 _LEAST_SIZE = 0.4
+# Frames that have looked at a place, at least.
+_LEAST_FRAMES = 6.0
 # The median of the size of a normal variable of standard deviation 1.
 _MEDIAN_SIZE = 0.6745
 
@@ -23,9 +25,9 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
     """Return which samples show something else than the scene, (T, N) bool.
 
     Something else covers several cores, so residuals are averaged over neighbours of a frame, which noise and wrong
-    gains do not survive. They are held against what is usual for all samples, for those of the frame and, where the
-    scene has edges, for those of other frames at the same place; and against the contrast of the scene, because the
-    sharpest frames of a burst that is mostly blurred differ from the others by right.
+    gains do not survive. They are held against what is usual for all samples, for those of the frame, for those of the
+    core and, where the scene has edges, for those of other frames at the same place; and against the contrast of the
+    scene, because the sharpest frames of a burst that is mostly blurred differ from the others by right.
 
     Parameters
     ----------
@@ -48,12 +50,14 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
     if not bool(counted.any()):
         return counted
     usual = size[counted].median() / _MEDIAN_SIZE
-    # A frame that is blurred, or registered badly, is off everywhere.
-    of_frame = torch.where(counted, size, torch.nan).nanmedian(dim=1, keepdim=True).values.nan_to_num() / _MEDIAN_SIZE
+    # A frame that is blurred is off everywhere, and a core at the rim that the model does not fit in every frame.
+    known = torch.where(counted, size, torch.nan)
+    of_frame, of_core = (known.nanmedian(dim=axis, keepdim=True).values.nan_to_num() / _MEDIAN_SIZE for axis in (1, 0))
     coarse = Grid.around(points[counted], samples.pitch, 2 * samples.pitch).at(points)
     # The mean size, as a normal variable's standard deviation; capped, so that outliers do not make themselves usual.
     there = _smooth(coarse, size.clamp(max=float(3 * usual)), weights) * math.sqrt(math.pi / 2)
-    score = size / torch.maximum(torch.maximum(usual, of_frame), there).clamp_min(1e-12)
+    score = size / torch.maximum(torch.maximum(there, usual), torch.maximum(of_frame, of_core)).clamp_min(1e-12)
+    counted &= _is_shared(coarse, in_frame, weights)
     far = (score > _FAR) & (size > _LEAST_SIZE * _contrast(samples)) & counted
     if not bool(far.any()):
         return far
@@ -63,6 +67,13 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
         near = in_frame(blur(in_frame.adjoint(far[frame].to(off)), nodes)) > 0.02
         also[frame] = near & (score[frame] > _ALSO) & counted[frame]
     return far | also
+
+
+def _is_shared(coarse: Sampling, in_frame: Sampling, weights: Tensor) -> Tensor:
+    """Return which samples (T, N) lie where enough frames have looked to say which of them is off."""
+    of_one = torch.stack([in_frame(blur(in_frame.adjoint(weight), 1.0)) for weight in weights])
+    of_all: Tensor = coarse(blur(coarse.adjoint(weights), 1.0))
+    return of_all > _LEAST_FRAMES * of_one
 
 
 def _contrast(samples: Samples) -> Tensor:

@@ -227,12 +227,12 @@ def _find_what_is_left(samples: Samples, registration: Registration) -> Shading 
         left = _left(ratios, weights, basis, solution)
         system = _normal_equations(ratios, weights, left, basis)
         solution, priors = priors.settled(system)
+        if not priors.stands_out(system, solution):
+            return None  # most bursts: they end here after one pass
         left = _left(ratios, weights, basis, solution)
         sizes = torch.from_numpy(left * np.sqrt(ratios.weights))
         robust = huber(sizes, torch.from_numpy(ratios.weights)).numpy()
     frames = len(known)
-    if not priors.stands_out(system, solution):
-        return None
     return _shading(basis, solution[:-frames].reshape(-1, basis.splines.shape[1]), solution[-frames:], samples)
 
 
