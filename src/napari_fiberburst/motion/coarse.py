@@ -28,7 +28,7 @@ _NEIGHBOURS = 3
 _LANDMARKS = 8
 # Brightness and contrast of the images are evened out over so many of their pixels (sigma of a Gaussian), contrast
 # where it is more than this part of the usual one.
-_NEIGHBOURHOOD, _LEAST_CONTRAST = 6.0, 0.5
+_NEIGHBOURHOOD, _LEAST_CONTRAST = 4.0, 0.5
 # Images that are this little alike do not show the same thing.
 LEAST_CONFIDENCE = 0.3
 

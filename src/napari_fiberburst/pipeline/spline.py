@@ -85,6 +85,9 @@ class SplineFit:
             notes=fitted.all_notes,
             noise=fitted.noise,
         )
+        if fitted.outliers is not None and diagnostics.outliers is not None:
+            early = fitted.outliers.cpu().numpy()
+            diagnostics = replace(diagnostics, outliers=diagnostics.outliers | early)
         return Reconstruction(
             image=draw(image, fitted.canvas, fitted.registration.reference, self._burst),
             canvas=fitted.canvas,

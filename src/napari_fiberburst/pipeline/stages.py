@@ -66,6 +66,8 @@ class Fitted:
         What a user should know, beside the notes of the registration.
     noise : Noise or None
         Of the camera; None where it cannot be told, or not yet.
+    outliers : Tensor or None
+        (T, G) bool, cores that were seen to show something else before the scene was solved; None if none were.
     """
 
     bundle: Bundle
@@ -77,6 +79,7 @@ class Fitted:
     image: SplineImage | None = None
     notes: tuple[str, ...] = ()
     noise: Noise | None = None
+    outliers: Tensor | None = None
 
     @property
     def recorded(self) -> Registration:
@@ -308,7 +311,7 @@ class Stages:
         samples = _seen(observe(self._frames, bundle, self._burst), fitted.mount)
         if outliers is not None:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
-        fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples)
+        fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples, outliers=outliers)
         steps = refining(
             samples,
             registration,
