@@ -65,7 +65,7 @@ docs: .venv/docs
 # tables: make docs-results MORE="--tables 1 2"
 docs-images: .venv/bench
 	mkdir -p docs/gallery
-	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence where_it_fails; do \
+	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence as_recorded where_it_fails; do \
 	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done
 	cd docs/gallery && rm -f cat.ome.tif cat.json
 
