@@ -2,9 +2,12 @@
 
 import numpy as np
 from napari.layers import Image
+from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.plugin.stacks import stabilised
+from napari_fiberburst.simulation import Camera, Faults, simulate
 
 MILLISECONDS = 60_000
 NETWORK = {"encoding": "fourier", "iterations": 400, "scene_width": 16, "scene_layers": 1, "features": 16, "batch": 64}
@@ -227,3 +230,39 @@ def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
     dock.runs.remove(dock.runs.runs[1])
     assert not dock.runs.compare_button.isChecked()
     assert [viewer.layers[f"run {number}: image"].visible for number in (1, 3)] == [True, False]
+
+
+def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_through):
+    bent = simulate(
+        "histology",
+        shape=(131, 147),
+        frames=10,
+        channels=1,
+        physics="core",
+        pitch=4.7,
+        seed=1,
+        camera=Camera(photons=8000, bits=10, exposure=0.8),
+        faults=Faults(deformation=4, intruder=0.08),
+    )
+    frames = bent.arrays()["frames"][..., 0]
+    viewer, dock = open_dock(Image(frames, name="burst"))
+    run = run_through(dock)
+    result = run.result
+    assert result.bends
+    arrows = viewer.layers["run 1: bending"]
+    assert not arrows.visible
+    drawn = arrows.data[arrows.data[:, 0, 0] == 4, 1, 1:]
+    rms = np.sqrt((result.displacement(4) ** 2).sum(axis=-1).mean())
+    assert 0.5 * rms < np.sqrt((drawn**2).sum(axis=1).mean()) < 2 * rms
+    outline = [shape for shape in viewer.layers["run 1: frame outlines"].data if shape[0, 0] == 4]
+    assert len(outline[0]) > 4
+    # Moved into place by all of its motion, a frame lies better on the object than by its homography alone.
+    still = np.asarray(viewer.layers["run 1: stabilised burst"].data[4], dtype=np.float64)
+    plain = np.asarray(stabilised(frames, result.homographies, result.canvas)[4], dtype=np.float64)
+    inner = (slice(20, -20), slice(20, -20))
+    truth = gaussian_filter(bent.truth[0, ..., 0], 4)[inner]
+    alike = [np.corrcoef(gaussian_filter(moved, 4)[inner].ravel(), truth.ravel())[0, 1] for moved in (still, plain)]
+    assert alike[0] > alike[1]
+    assert (result.outliers.any()) == ("run 1: left out" in viewer.layers)
+    assert f">{result.quality}</b>" in dock.display.status.text()
+    assert run.summary.startswith(result.quality)

@@ -47,9 +47,9 @@ _LEAST_OF_USUAL = 0.6
 _MOST_SWELLING = 3.0
 # Pixels: iterations at a level end where no frame's centre moves farther than this.
 _ENOUGH = 0.015
-# Frames may bend where their residuals ask for it by at least this score, and do where that leaves at most this part of
-# the residuals.
-_LEAST_BENDING_SCORE, _MOST_LEFT_BY_BENDING = 3.0, 0.9
+# Frames may bend where their residuals ask for it by the first score, or by the second and leave more unexplained than
+# this; and do where that leaves at most this part of the residuals.
+_CLEAR_SCORE, _SCORE, _UNEXPLAINED_BY_PLANES, _MOST_LEFT_BY_BENDING = 3.0, 1.6, 0.14, 0.9
 # A registration that leaves more unexplained than this has failed, or the model is wrong. Of simulated bursts those
 # that are registered to some tenths of a pixel leave up to 0.2 without noise, and those that are not 0.26 and more.
 MOST_UNEXPLAINED = 0.22
@@ -404,10 +404,12 @@ class _Search:
         """Whether what is left of rigid frames has the structure that displacements leave."""
         if found.scene is None or self._is_spent(found):
             return False
-        if _unexplained(found, self.samples, self.noise) > MOST_UNEXPLAINED:
+        unexplained = _unexplained(found, self.samples, self.noise)
+        if unexplained > MOST_UNEXPLAINED:
             return True
         problem = self._problem(found, found.scene.light, None)
-        return bending_score(problem, self._resumed(found, found.scene, problem)) > _LEAST_BENDING_SCORE
+        score = bending_score(problem, self._resumed(found, found.scene, problem))
+        return score > (_SCORE if unexplained > _UNEXPLAINED_BY_PLANES else _CLEAR_SCORE)
 
     def _is_spent(self, found: Registration) -> bool:
         return self.iterations is not None and found.iterations >= self.iterations
