@@ -30,8 +30,9 @@ _LEAST_DETAIL = 0.4
 # So many samples, and frames, are enough to tell.
 _DETAIL_SAMPLES = 300_000
 _LEAST_DETAIL_FRAMES = 4
-# Only pixels that pass at least this part of a bright core's light are asked.
-_LIT = 0.5
+# Only pixels that pass at least this part of a bright core's light are asked, of cores with at least this part of the
+# mean light.
+_LIT, _LEAST_LIT_CORE = 0.5, 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -275,7 +276,9 @@ def shows_detail(
         scene = predicted(number, pixels)
         mean = torch.zeros(count).to(grey).index_add_(0, labels, passed**2 * scene) / area
         core = cores.values[number, labels].mean(dim=-1)
-        usable = (scene > 0) & (cores.weights[number, labels] > 0) & (core > 0) & (mean[labels] > 0)
+        # Of a core in the dark nothing can be said in parts of its light.
+        floor = _LEAST_LIT_CORE * mean.mean()
+        usable = (scene > 0) & (cores.weights[number, labels] > 0) & (core > floor) & (mean[labels] > floor)
         weight = passed**2 * core.square() * usable
         expected = torch.where(usable, scene / mean[labels].clamp_min(1e-6) - 1, torch.zeros_like(scene))
         light = (grey[number][lit] - known.black) / passed

@@ -66,7 +66,7 @@ class SimulatedBurst:
         (T, 2) float64: how far the bundle has moved on the camera since frame 0, (x, y) in pixels.
     displacement : numpy.ndarray or None
         (T, H, W, 2) float32, (x, y) in pixels: the pixel x of frame t looks at the point
-        homographies[t](x) + displacement[t](x) of frame 0.
+        ``homographies[t](x) + displacement[t](x)`` of frame 0.
     intruder : numpy.ndarray or None
         (T, H, W) bool: where something else hides the object.
     background : numpy.ndarray or None
