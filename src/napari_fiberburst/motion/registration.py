@@ -15,7 +15,6 @@ from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import LEAST_CONFIDENCE, confidence, find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
-from napari_fiberburst.motion.linearised import huber
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.motion.problem import (
     BENDING,
@@ -486,14 +485,7 @@ def _judged(found: Registration, samples: Samples) -> Registration:
     samples = samples.weighted(torch.from_numpy(found.used))
     gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
     values = samples.grey / (exposures[:, None] * gains[samples.core_index])
-    weights = samples.weights
-    if found.scene is not None:
-        # What passes before the object must not speak for the frame.
-        sampling = found.scene.grid.at(found.motion.apply(samples.positions))
-        off = values - found.scene.light * sampling(found.scene.nodes)
-        parts = zip(off, weights * sampling.inside, strict=True)
-        weights = weights * torch.stack([huber(one, weight) for one, weight in parts]).square()
-    agreement = confidence(samples.positions, values, weights, found.motion, samples.pitch)
+    agreement = confidence(samples.positions, values, samples.weights, found.motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
     used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))
     judged = replace(found, used=used, confidence=trust, frame_weights=used.astype(np.float32))
