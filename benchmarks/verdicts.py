@@ -22,7 +22,7 @@ from benchmarks.compare import score
 from benchmarks.methods import Outcome
 from napari_fiberburst.pipeline import diagnose as judging
 from napari_fiberburst.pipeline.reconstruct import reconstruct
-from napari_fiberburst.pipeline.verdict import Evidence, collect
+from napari_fiberburst.pipeline.verdict import GoodnessOfFit, collect
 
 MOST_LOSS = 3.0
 FAULTS: Mapping[str, Mapping[str, Any]] = {
@@ -71,14 +71,14 @@ def main() -> int:
         for name, case, is_faulty in cases(base):
             if options.only and name not in options.only:
                 continue
-            quality, verdict, evidence = judged(case)
+            quality, verdict, fit = judged(case)
             best = quality if name == "clean" else best
             loss = best - quality if is_faulty else 0.0
             is_wrong = (loss > MOST_LOSS and verdict == "good") or (not is_faulty and verdict != "good")
             wrong += is_wrong
             print(
-                f"{scene:10}{name:26}{quality:6.2f} dB, loses {loss:6.2f}  error {evidence.error:.3f}  misfit "
-                f"{evidence.misfit:6.2f}  uneven {evidence.unevenness:5.2f}  structure {evidence.structure:5.2f}  "
+                f"{scene:10}{name:26}{quality:6.2f} dB, loses {loss:6.2f}  error {fit.error:.3f}  misfit "
+                f"{fit.misfit:6.2f}  uneven {fit.unevenness:5.2f}  structure {fit.structure:5.2f}  "
                 f"{verdict}{'  WRONG' if is_wrong else ''}",
                 flush=True,
             )
@@ -94,12 +94,12 @@ def cases(base: Case) -> Iterator[tuple[str, Case, bool]]:
         yield name, replace(base, name=name, **change), False
 
 
-def judged(case: Case) -> tuple[float, str, Evidence]:
+def judged(case: Case) -> tuple[float, str, GoodnessOfFit]:
     """Return PSNR, verdict and what it is made of."""
     simulated = case.make()
-    kept: list[Evidence] = []
+    kept: list[GoodnessOfFit] = []
 
-    def keep(*arguments: Any) -> Evidence:
+    def keep(*arguments: Any) -> GoodnessOfFit:
         kept.append(collect(*arguments))
         return kept[-1]
 

@@ -81,6 +81,13 @@ class Samples(Stored):
         """Values averaged over the channels, (T, N)."""
         return self.values.mean(dim=2)
 
+    @property
+    def contrast(self) -> Tensor:
+        """Standard deviation of the grey values, by their weights; a scalar."""
+        mass = self.weights.sum().clamp_min(1e-9)
+        mean = (self.weights * self.grey).sum() / mass
+        return ((self.weights * (self.grey - mean).square()).sum() / mass).sqrt()
+
     def without_gains(self, gains: Tensor) -> "Samples":
         """Return the samples with each core's gain (G,) or (G, C) taken out of their values."""
         own = gains[self.core_index]

@@ -469,11 +469,16 @@ def _frame_weights(problem: JointProblem, state: JointState, used: NDArray[np.bo
     return weights
 
 
+def _evened(found: Registration, samples: Samples) -> Tensor:
+    """Return grey values at gains and exposures of 1, (T, N)."""
+    gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
+    return samples.grey / (exposures[:, None] * gains[samples.core_index])
+
+
 def _unexplained(found: Registration, samples: Samples, noise: float) -> float:
     """Return what part of the samples' change from frame to frame is left, as a ratio of root mean squares."""
     samples = samples.weighted(torch.from_numpy(found.used))
-    gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
-    values, weights = samples.grey / (exposures[:, None] * gains[samples.core_index]), samples.weights
+    values, weights = _evened(found, samples), samples.weights
     mean = (weights * values).sum(dim=0) / weights.sum(dim=0).clamp_min(1e-9)
     change = float((weights * (values - mean).square()).sum() / weights.sum().clamp_min(1e-9))
     left = max(found.residual**2 - noise**2, 0.0)
@@ -483,9 +488,7 @@ def _unexplained(found: Registration, samples: Samples, noise: float) -> float:
 def _judged(found: Registration, samples: Samples) -> Registration:
     """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
     samples = samples.weighted(torch.from_numpy(found.used))
-    gains, exposures = (torch.from_numpy(part).to(samples.values) for part in (found.gains, found.exposures))
-    values = samples.grey / (exposures[:, None] * gains[samples.core_index])
-    agreement = confidence(samples.positions, values, samples.weights, found.motion, samples.pitch)
+    agreement = confidence(samples.positions, _evened(found, samples), samples.weights, found.motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
     used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))
     judged = replace(found, used=used, confidence=trust, frame_weights=used.astype(np.float32))

@@ -90,12 +90,12 @@ def diagnose(
     most = max(float(scene.coefficients.std()), 1e-6)
     std = scene.equations.posterior_std(scene.smoothness, variance, most, max(1.0, bundle.radius))
     expected = scene.grid.at(_places(canvas, std))(std)
-    evidence = collect(scene, registration, _variance(noise, bundle, acquisition, registration, samples))
-    verdict = judge(evidence, registration, bundle.pitch, gains_known=bundle.gains_known)
+    fit = collect(scene, registration, _variance(noise, bundle, acquisition, registration, samples))
+    verdict = judge(fit, registration, bundle.pitch, gains_known=bundle.gains_known)
     return replace(
         found,
         quality=verdict.quality,
-        misfit=evidence.misfit if math.isfinite(evidence.misfit) else None,
+        misfit=fit.misfit if math.isfinite(fit.misfit) else None,
         notes=(*notes, *verdict.reasons),
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
         residuals=(residuals * span).cpu().numpy().astype(np.float32),

@@ -292,7 +292,9 @@ class Stages:
         """Take the shading that the motion tells into bundle, samples and exposures."""
         assert fitted.samples is not None
         samples, registration = fitted.samples, fitted.registration
-        cores = samples if samples.kind == "cores" else sample_cores(self._frames, fitted.bundle, self._burst)
+        cores = samples
+        if samples.kind != "cores":
+            cores = _seen(sample_cores(self._frames, fitted.bundle, self._burst), fitted.mount)
         shading = find_shading(cores, registration)
         if shading is None:
             return fitted

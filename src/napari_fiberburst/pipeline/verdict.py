@@ -4,7 +4,7 @@ Every criterion holds what the model leaves unexplained against what noise and a
 that tell simulated bursts which lose more than 3 dB by a fault from bursts without one (`benchmarks/verdicts.py`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -37,7 +37,7 @@ _NEIGHBOURS = 1.4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
+class GoodnessOfFit:
     """What a verdict is made of; NaN where it is not known.
 
     Attributes
@@ -90,7 +90,7 @@ class Verdict:
     reasons: tuple[str, ...] = ()
 
 
-def collect(scene: Scene, registration: Registration, variance: Tensor | None) -> Evidence:
+def collect(scene: Scene, registration: Registration, variance: Tensor | None) -> GoodnessOfFit:
     """Return what the samples say of the scene that was solved from them.
 
     Parameters
@@ -108,17 +108,16 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
     known = torch.isfinite(off)
     mass = samples.weights * known
     total = mass.sum().clamp_min(1e-9)
-    grey = samples.grey
-    spread = ((mass * (grey - (mass * grey).sum() / total).square()).sum() / total).sqrt()
+    contrast = float(replace(samples, weights=mass).contrast)
     noise = 0.0 if variance is None else float((mass * variance).sum() / total)
     held_out = float("nan") if scene.held_out_rmse is None else scene.held_out_rmse
-    expected = noise + float((mass * (_GAIN_ERROR * grey) ** 2).sum() / total)
-    error = max(held_out**2 - expected, 0.0) ** 0.5 / max(float(spread), 1e-9) if held_out == held_out else held_out
+    expected = noise + float((mass * (_GAIN_ERROR * samples.grey) ** 2).sum() / total)
+    error = max(held_out**2 - expected, 0.0) ** 0.5 / max(contrast, 1e-9) if held_out == held_out else held_out
     channels = samples.values.shape[2]
     scaled = off.square() * (1.0 if variance is None else channels / variance.clamp_min(1e-12))
     counts = known.sum(dim=1)
     per_frame = torch.where(known, scaled, 0.0).sum(dim=1) / counts.clamp_min(1)
-    return Evidence(
+    return GoodnessOfFit(
         error=error,
         misfit=float("nan") if variance is None else float(scaled[known].mean().sqrt()),
         frame_misfit=tuple(
@@ -130,12 +129,12 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
     )
 
 
-def judge(evidence: Evidence, registration: Registration, pitch: float, *, gains_known: bool) -> Verdict:
+def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains_known: bool) -> Verdict:
     """Return the verdict.
 
     Parameters
     ----------
-    evidence : Evidence
+    fit : GoodnessOfFit
         By `collect`.
     registration : Registration
         Of the burst.
@@ -148,18 +147,18 @@ def judge(evidence: Evidence, registration: Registration, pitch: float, *, gains
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
-    allowed = (1.0 if evidence.is_noise_known else _WITH_NOISE) * max(1.0, _ENOUGH_FRAMES / max(1, used))
-    if not registration.is_still and evidence.error > _DOUBTFUL_ERROR * allowed:
-        is_bad = evidence.error > _BAD_ERROR * allowed
+    allowed = (1.0 if fit.is_noise_known else _WITH_NOISE) * max(1.0, _ENOUGH_FRAMES / max(1, used))
+    if not registration.is_still and fit.error > _DOUBTFUL_ERROR * allowed:
+        is_bad = fit.error > _BAD_ERROR * allowed
         reasons.append(
-            f"samples that were left out are missed by {100 * evidence.error:.0f} % of their contrast: the object "
+            f"samples that were left out are missed by {100 * fit.error:.0f} % of their contrast: the object "
             "moves or changes in other ways than by the motion that was found"
         )
-    if evidence.structure > _STRUCTURE:
+    if fit.structure > _STRUCTURE:
         reasons.append(
             "what the image leaves unexplained is alike in neighbouring cores, so something else than noise is in it"
         )
-    if evidence.unevenness > _UNEVEN_FRAMES:
+    if fit.unevenness > _UNEVEN_FRAMES:
         reasons.append("many frames fit much worse than others: they are blurred, or out of focus")
     if count > 1 and used < max(2, _LEAST_USED * count):
         is_bad = is_bad or used < 2

@@ -58,7 +58,7 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
     there = _smooth(coarse, size.clamp(max=float(3 * usual)), weights) * math.sqrt(math.pi / 2)
     score = size / torch.maximum(torch.maximum(there, usual), torch.maximum(of_frame, of_core)).clamp_min(1e-12)
     counted &= _is_shared(coarse, in_frame, weights)
-    far = (score > _FAR) & (size > _LEAST_SIZE * _contrast(samples)) & counted
+    far = (score > _FAR) & (size > _LEAST_SIZE * samples.contrast) & counted
     if not bool(far.any()):
         return far
     also = torch.zeros_like(far)
@@ -74,13 +74,6 @@ def _is_shared(coarse: Sampling, in_frame: Sampling, weights: Tensor) -> Tensor:
     of_one = torch.stack([in_frame(blur(in_frame.adjoint(weight), 1.0)) for weight in weights])
     of_all: Tensor = coarse(blur(coarse.adjoint(weights), 1.0))
     return of_all > _LEAST_FRAMES * of_one
-
-
-def _contrast(samples: Samples) -> Tensor:
-    """Return the standard deviation of the samples."""
-    mass = samples.weights.sum().clamp_min(1e-9)
-    mean = (samples.weights * samples.grey).sum() / mass
-    return ((samples.weights * (samples.grey - mean).square()).sum() / mass).sqrt()
 
 
 def _smooth(at: Sampling, values: Tensor, weights: Tensor) -> Tensor:
