@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from napari_fiberburst.data.burst import Burst as Burst
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
     from napari_fiberburst.io import read_burst as read_burst
+    from napari_fiberburst.motion.register import refine as refine
+    from napari_fiberburst.motion.register import register as register
     from napari_fiberburst.motion.registration import Registration as Registration
-    from napari_fiberburst.motion.registration import refine as refine
-    from napari_fiberburst.motion.registration import register as register
     from napari_fiberburst.networks.image import load as load
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
@@ -56,8 +56,8 @@ _HOMES = {
     "load": "networks.image",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
-    "refine": "motion.registration",
-    "register": "motion.registration",
+    "refine": "motion.register",
+    "register": "motion.register",
     "remeasure": "pipeline.remeasure",
     "render": "pipeline.render",
     "sample": "bundle.samples",

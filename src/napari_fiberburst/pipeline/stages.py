@@ -22,7 +22,9 @@ from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixel
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.motion.registration import MOST_UNEXPLAINED, Registration, refining, registering, unregistered
+from napari_fiberburst.motion.register import refining, registering
+from napari_fiberburst.motion.registration import Registration, unregistered
+from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.remeasure import lit, remeasured
 from napari_fiberburst.pipeline.render import image_of
