@@ -144,7 +144,8 @@ class RunLayers:
         if result.outliers is not None and bundle.is_resolved and result.outliers.any():
             yield
             maps = residual_maps(result.outliers.astype(np.float32), bundle.labels)
-            self._add("left out", maps, "TYX", colormap="magenta", contrast_limits=(0.0, 1.0))
+            # Over the frames, which show what was left out.
+            self._add("left out", maps, "TYX", colormap="magenta", contrast_limits=(0.0, 1.0), blending="additive")
 
     def tell(self, name: str, value: Any) -> None:
         """Write something more into the metadata of all layers of the run."""
