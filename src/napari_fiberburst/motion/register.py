@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.coarse import find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
+from napari_fiberburst.motion.freedom import restrict
 from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.motion.problem import (
@@ -39,6 +40,8 @@ _ENOUGH = 0.015
 # Frames may bend where their residuals ask for it by the first score, or by the second and leave more unexplained than
 # this; and do where that leaves at most this part of the residuals.
 _CLEAR_SCORE, _SCORE, _UNEXPLAINED_BY_PLANES, _MOST_LEFT_BY_BENDING = 3.0, 1.6, 0.14, 0.9
+# Degrees of freedom of a homography.
+_MOST_FREEDOM = 8
 # Of full scale: the mean light that values are divided by, at least.
 _LEAST_LIGHT = 1e-4
 
@@ -46,7 +49,7 @@ _LEAST_LIGHT = 1e-4
 def register(
     samples: Samples,
     *,
-    dof: int = 8,
+    dof: int | None = None,
     bends: bool | None = None,
     noise: float = 0.0,
     iterations: int | None = None,
@@ -58,9 +61,9 @@ def register(
     ----------
     samples : Samples
         Of whole cores, grey or in colour.
-    dof : int
+    dof : int, optional
         Degrees of freedom of each frame's motion: 2 for a translation, 4 for a similarity, 6 for an affine transform, 8
-        for a homography; 0 where the frames are known not to move.
+        for a homography; 0 where the frames are known not to move. None takes as few as explain it.
     bends : bool, optional
         Whether frames bend beyond that; None lets the residuals tell.
     noise : float
@@ -79,7 +82,7 @@ def register(
 
 
 def refine(
-    samples: Samples, registration: Registration, *, dof: int = 8, iterations: int | None = None, seed: int = 0
+    samples: Samples, registration: Registration, *, iterations: int | None = None, seed: int = 0
 ) -> Registration:
     """Refine a registration to some hundredths of a pixel, with the footprint of the samples in the model.
 
@@ -89,7 +92,7 @@ def refine(
         Of cores or of pixels, by a bundle that was measured again after the frames were registered.
     registration : Registration
         By `register`. One whose object does not move is returned as it is.
-    dof, seed
+    seed
         As for `register`.
     iterations : int, optional
         Gauss-Newton iterations at most, those of `registration` included.
@@ -99,14 +102,14 @@ def refine(
     Registration
         With the gains relative to what the samples assume.
     """
-    return drain(refining(samples, registration, dof=dof, iterations=iterations, seed=seed))
+    return drain(refining(samples, registration, iterations=iterations, seed=seed))
 
 
 def registering(
-    samples: Samples, *, dof: int, bends: bool | None, noise: float, iterations: int | None, seed: int
+    samples: Samples, *, dof: int | None, bends: bool | None, noise: float, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
     """Register as `register` does; yields what is known after each iteration."""
-    start = unregistered(samples)
+    start = replace(unregistered(samples), dof=_MOST_FREEDOM if dof is None else dof)
     if len(samples.values) < 2:
         return alone(start, samples)
     if dof == 0:
@@ -126,7 +129,7 @@ def registering(
     yield found
     if found.used.sum() < 2:
         return alone(found, samples)
-    search = _Search(samples=samples, dof=dof, shifts=moved, noise=noise, iterations=iterations, seed=seed)
+    search = _Search(samples=samples, shifts=moved, noise=noise, iterations=iterations, seed=seed)
     found = yield from search.refine(replace(found, stage="coarse"), (COARSE,), None, _COARSE_SAMPLES)
     found = replace(found, stage="fine")
     yield found
@@ -134,6 +137,8 @@ def registering(
     if bends or (bends is None and search.asks_to_bend(found)):
         bent = yield from search.refine(_bendable(found, samples), BENDING, None, None)
         found = bent if bends or bent.residual < _MOST_LEFT_BY_BENDING * found.residual else found
+    if dof is None and found.displacement is None:
+        found = search.restricted(found)
     found = judged(replace(found, unexplained=unexplained_part(found, samples, noise)), samples)
     if found.used.sum() < 2:
         return alone(found, samples)
@@ -141,7 +146,7 @@ def registering(
 
 
 def refining(
-    samples: Samples, found: Registration, *, dof: int, iterations: int | None, seed: int
+    samples: Samples, found: Registration, *, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
     """Refine a registration, and find the gains, by the final samples of the bundle; yields after each iteration.
 
@@ -151,7 +156,7 @@ def refining(
         Of cores, with their footprint, or of pixels.
     found : Registration
         By `register`; its frames lie on the same scene.
-    dof, seed
+    seed
         As for `register`.
     iterations : int, optional
         Gauss-Newton iterations at most, those that `found` has had included.
@@ -159,7 +164,7 @@ def refining(
     if found.scene is None or found.is_still:
         return found
     shifts = found.scene_from_frame[:, :2, 2].copy()
-    search = _Search(samples=samples, dof=dof, shifts=shifts, noise=0.0, iterations=iterations, seed=seed)
+    search = _Search(samples=samples, shifts=shifts, noise=0.0, iterations=iterations, seed=seed)
     levels, most = (FINE_PIXELS, _MOST_SAMPLES) if samples.kind == "pixels" else (FINE_CORES, None)
     return (yield from search.refine(found, levels, samples.radius, most))
 
@@ -169,7 +174,6 @@ class _Search:
     """Gauss-Newton iterations from where the frames lie."""
 
     samples: Samples
-    dof: int
     shifts: NDArray[np.float64]
     noise: float
     iterations: int | None
@@ -226,6 +230,22 @@ class _Search:
         score = bending_score(problem, self._resumed(found, found.scene, problem))
         return score > (_SCORE if unexplained > _UNEXPLAINED_BY_PLANES else _CLEAR_SCORE)
 
+    def restricted(self, found: Registration) -> Registration:
+        """Return the registration within the smallest model of motion that explains it."""
+        if found.scene is None or self._is_spent(found):
+            return found
+        problem = self._problem(found, found.scene.light, None)
+        state = self._resumed(found, found.scene, problem)
+        restriction = restrict(problem, state)
+        if restriction is None:
+            return found
+        return replace(
+            found,
+            dof=restriction.dof,
+            scene_from_frame=restriction.motion.scene_from_frame.numpy(),
+            scene=replace(found.scene, nodes=restriction.scene(state)),
+        )
+
     def _is_spent(self, found: Registration) -> bool:
         return self.iterations is not None and found.iterations >= self.iterations
 
@@ -244,7 +264,7 @@ class _Search:
             core_index=samples.core_index[chosen],
             cores=samples.cores,
             pitch=samples.pitch,
-            dof=self.dof,
+            dof=found.dof,
             gains_fixed=samples.gains_known,
             controls=None if found.displacement is None else found.displacement.grid.at(samples.positions[chosen]),
         )

@@ -79,6 +79,8 @@ class Registration(Stored):
         The scene that the frames were registered to.
     displacement : Displacement or None
         How frames bend beyond their homographies; None where they were not asked to.
+    dof : int
+        Degrees of freedom of each frame's transform: 0, 2 (translation), 4 (similarity), 6 (affine), 8 (homography).
     """
 
     _kind: ClassVar[str] = "registration"
@@ -99,6 +101,7 @@ class Registration(Stored):
     notes: tuple[str, ...] = ()
     scene: GreyScene | None = field(default=None, repr=False)
     displacement: Displacement | None = field(default=None, repr=False)
+    dof: int = 8
 
     @classmethod
     def known(cls, scene_from_frame: NDArray[np.float64], shape: tuple[int, int], cores: int) -> "Registration":

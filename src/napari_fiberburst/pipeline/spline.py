@@ -8,11 +8,22 @@ import torch
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.stages import Fitted, Stages
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
-from napari_fiberburst.settings import AutoMotion, Deformable, Homography, Settings, SplineMethod
+from napari_fiberburst.settings import (
+    Affine,
+    AutoMotion,
+    Deformable,
+    Homography,
+    Settings,
+    Similarity,
+    SplineMethod,
+    Translation,
+)
+from napari_fiberburst.settings.choices import SplineMotion
 
 # Rounds and stages that a fit has, about: what is left is counted in these.
 _PLANNED = 27
@@ -147,8 +158,14 @@ class SplineFit:
         if fitted.scene is not None and (is_last or not fitted.scene.is_draft):
             method = replace(method, smoothness=fitted.scene.smoothness)
         if is_last and isinstance(method.motion, AutoMotion):
-            bends = fitted.registration.displacement is not None
-            method = replace(method, motion=Deformable() if bends else Homography())
+            method = replace(method, motion=_motion_of(fitted.registration))
         if is_last:
             method = replace(method, iterations=fitted.registration.iterations or method.iterations or 1)
         return replace(self._requested, method=method, device=str(self._device))
+
+
+def _motion_of(registration: Registration) -> SplineMotion:
+    """Return the model that the frames of a registration move by."""
+    if registration.displacement is not None:
+        return Deformable()
+    return next(model() for model in (Translation, Similarity, Affine, Homography) if model.dof >= registration.dof)

@@ -135,10 +135,10 @@ class Deformable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AutoMotion:
-    """Homography or deformable, as samples that are left out approve."""
+    """As much freedom as the burst asks for: translation, similarity, affine, homography, or deformable."""
 
     name: ClassVar[str] = "auto"
-    dof: ClassVar[int] = 8
+    dof: ClassVar[None] = None
     bends: ClassVar[None] = None
 
 
