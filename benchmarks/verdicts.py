@@ -127,8 +127,8 @@ def report(bursts: Iterator[tuple[str, bool, SimulatedBurst, SimulatedBurst]]) -
         fit = found.fit
         line = (
             f"{name:60}{quality:6.2f} dB, loses {loss:6.2f}  error {fit.error:.3f}  halves {fit.disagreement:.3f}  "
-            f"misfit {fit.misfit:6.2f}  uneven {fit.unevenness:5.2f}  structure {fit.structure:5.2f}  "
-            f"still {fit.still:5.2f}  {found.verdict}"
+            f"misfit {fit.misfit:6.2f}  uneven {fit.unevenness:5.2f}  peak {fit.peak:5.2f}  "
+            f"structure {fit.structure:5.2f}  still {fit.still:5.2f}  {found.verdict}"
         )
         is_wrong = (loss > MOST_LOSS and found.verdict == "good") or (not is_faulty and found.verdict != "good")
         if is_wrong:

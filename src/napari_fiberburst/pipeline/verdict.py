@@ -32,9 +32,12 @@ _DISAGREEMENT = 0.25
 _NOISE_ALONE = 1.07
 # Cores' gains are not known better than to this part, so errors of this part of the light are to be expected.
 _GAIN_ERROR = 0.01
-# Ratio of the residuals of blurred frames to those of sharp ones, upper to lower quartile, less 1; it grows as frames get
-# fewer, as above. Frames may differ by so much where the error is less than this part of what is allowed.
+# Ratio of the residuals of blurred frames to those of sharp ones, upper to lower quartile, less 1; it grows as frames
+# get fewer, as above. Frames may differ by more where the error is less than this part of what is allowed.
 _UNEVEN_FRAMES, _SMALL_ERROR = 0.5, 0.5
+# Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
+# edges stand out in it, so it grows with the square of the above.
+_UNEVEN_CORES, _WORST = 6.0, 0.99
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
@@ -97,6 +100,13 @@ class GoodnessOfFit:
             return float("nan")
         low, high = np.quantile(known, [0.25, 0.75])
         return float(high / low)
+
+    @property
+    def peak(self) -> float:
+        """Misfit of the worst cores over that of a typical one."""
+        known = self.core_misfit[np.isfinite(self.core_misfit)]
+        typical = float(np.median(known)) if len(known) else 0.0
+        return float(np.quantile(known, _WORST)) / typical if typical > 0 else float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,6 +237,10 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
         reasons.append("edges are sharper in some frames than in others: the object moved while frames were exposed")
     if fit.unevenness > 1 + _UNEVEN_FRAMES * gaps and fit.error > _SMALL_ERROR * allowed:
         reasons.append("many frames fit much worse than others: they are blurred, or out of focus")
+    if fit.is_noise_known and fit.peak > _UNEVEN_CORES * gaps**2 and fit.error > _SMALL_ERROR * allowed:
+        reasons.append(
+            "some cores fit much worse than others, such as those at a rim or under a mark: the image is wrong there"
+        )
     if count > 1 and used < max(2, _LEAST_USED * count):
         is_bad = is_bad or used < 2
         reasons.append(f"only {used} of {count} frames could be registered")
