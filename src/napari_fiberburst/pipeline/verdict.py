@@ -32,16 +32,18 @@ _DISAGREEMENT = 0.25
 _NOISE_ALONE = 1.07
 # Cores' gains are not known better than to this part, so errors of this part of the light are to be expected.
 _GAIN_ERROR = 0.01
+# Below this part of the error that is allowed, signs of single faults do not matter.
+_SMALL_ERROR = 0.5
 # Ratio of the residuals of blurred frames to those of sharp ones, upper to lower quartile, less 1; it grows as frames
-# get fewer, as above. Frames may differ by more where the error is less than this part of what is allowed.
-_UNEVEN_FRAMES, _SMALL_ERROR = 0.5, 0.5
+# get fewer, as above.
+_UNEVEN_FRAMES = 0.5
 # Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
 # edges stand out in it, so it grows with the square of the above.
 _UNEVEN_CORES, _WORST = 6.0, 0.99
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
-_STRUCTURE, _BLURRED = 0.2, -0.03
+_STRUCTURE, _BLURRED = 0.12, -0.03
 # Power of what stands still in the residuals, 1 for noise.
 _STILL_PATTERN = 2.2
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
@@ -213,6 +215,7 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     gaps = max(1.0, _ENOUGH_FRAMES / max(1, used))
     is_more_than_noise = not registration.is_still and not fit.misfit <= _NOISE_ALONE
     allowed = _DOUBTFUL_ERROR * gaps if fit.is_noise_known else _DOUBTFUL_PIXELS
+    is_material = fit.error > _SMALL_ERROR * allowed
     if is_more_than_noise and fit.error > allowed:
         is_bad = fit.error > allowed * _BAD_ERROR / _DOUBTFUL_ERROR
         reasons.append(
@@ -229,15 +232,15 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
             "a pattern that stands still in all frames is not explained: a bundle that was not found, light of the "
             "bundle itself, or an object that was held for one"
         )
-    if fit.is_noise_known and fit.structure > _STRUCTURE:
+    if fit.is_noise_known and fit.structure > _STRUCTURE and is_material:
         reasons.append(
             "what the image leaves unexplained is alike in neighbouring cores, so something else than noise is in it"
         )
     if fit.is_noise_known and fit.structure < _BLURRED:
         reasons.append("edges are sharper in some frames than in others: the object moved while frames were exposed")
-    if fit.unevenness > 1 + _UNEVEN_FRAMES * gaps and fit.error > _SMALL_ERROR * allowed:
+    if fit.unevenness > 1 + _UNEVEN_FRAMES * gaps and is_material:
         reasons.append("many frames fit much worse than others: they are blurred, or out of focus")
-    if fit.is_noise_known and fit.peak > _UNEVEN_CORES * gaps**2 and fit.error > _SMALL_ERROR * allowed:
+    if fit.is_noise_known and fit.peak > _UNEVEN_CORES * gaps**2 and is_material:
         reasons.append(
             "some cores fit much worse than others, such as those at a rim or under a mark: the image is wrong there"
         )

@@ -14,8 +14,8 @@ from napari_fiberburst.scene.spline import NormalEquations
 # Between nodes, in pitches, and where samples are pixels at most in those: a comparison needs no finer detail.
 _SPACING, _SPACING_OF_PIXELS = 0.5, 2.0
 _ITERATIONS = 30
-# In nodes, over which the density of samples is averaged; and the part of the usual density that both halves need.
-_NEAR, _LEAST_DENSITY = 1.5, 0.3
+# In nodes, over which the density of samples is averaged; and the part of the highest density that both halves need.
+_NEAR, _LEAST_DENSITY = 1.5, 0.15
 _LEAST_NODES = 10
 
 
@@ -53,10 +53,7 @@ def disagreement(samples: Samples, points: Tensor, frames: NDArray[np.intp]) -> 
             normal = normal.with_samples(points[frame], grey[frame], samples.weights[frame])
         shown.append(normal.through(normal.solve(UNTOLD, normal.mean(), _ITERATIONS))[0])
         densities.append(blur(normal.density(), _NEAR))
-    either = torch.maximum(*densities)
-    if not bool((either > 0).any()):
-        return float("nan")
-    both = torch.minimum(*densities) > _LEAST_DENSITY * either[either > 0].median()
+    both = torch.minimum(*densities) > _LEAST_DENSITY * torch.maximum(*densities).max()
     if int(both.sum()) < _LEAST_NODES:
         return float("nan")
     return float((shown[0] - shown[1])[both].std(correction=0)) / 2
