@@ -19,7 +19,7 @@ def scene_at(points, shift=0.0):
 
 @pytest.fixture
 def burst():
-    """Samples of one smooth scene at a walk of twelve frames, and where they lie."""
+    """Return samples of one smooth scene along a walk of twelve frames, and where they lie."""
     rng = np.random.default_rng(0)
     positions = torch.from_numpy(rng.uniform((0, 0), SHAPE[::-1], (700, 2))).float()
     walk = torch.from_numpy(np.cumsum(rng.normal(0, 2.0, (12, 1, 2)), axis=0)).float()

@@ -174,7 +174,8 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
         noise = channels * max(alone, 0.0)
     else:
         noise = _mean(mass, variance)
-    change = max(_change(replace(samples, weights=mass)) - noise / channels, 1e-12) ** 0.5
+    changed = _change(replace(samples, weights=mass)) - noise / channels
+    change = changed**0.5 if changed > 0 else float("nan")  # the noise hides all that the object does
     expected = noise + _GAIN_ERROR**2 * _mean(mass, samples.grey.square())
     error = float("nan") if scene.held_out_rmse is None else max(scene.held_out_rmse**2 - expected, 0.0) ** 0.5
     scaled = left.off.square() * (1.0 if variance is None else channels / variance.clamp_min(1e-12))
@@ -213,6 +214,7 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
     gaps = max(1.0, _ENOUGH_FRAMES / max(1, used))
+    # NaN, a misfit that is not known, is no reason to take it for noise.
     is_more_than_noise = not registration.is_still and not fit.misfit <= _NOISE_ALONE
     allowed = _DOUBTFUL_ERROR * gaps if fit.is_noise_known else _DOUBTFUL_PIXELS
     is_material = fit.error > _SMALL_ERROR * allowed
