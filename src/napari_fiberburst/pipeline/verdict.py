@@ -39,7 +39,7 @@ _SMALL_ERROR = 0.5
 _UNEVEN_FRAMES = 0.5
 # Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
 # edges stand out in it, so it grows with the square of the above.
-_UNEVEN_CORES, _WORST = 6.0, 0.99
+_UNEVEN_CORES, _WORST = 9.0, 0.99
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
