@@ -2,27 +2,34 @@
 
     python -m benchmarks.verdicts
     python -m benchmarks.verdicts --scenes cat usaf
+    python -m benchmarks.verdicts --unseen 200
 
-Bursts with the faults of Table 6 at its strengths and beyond them, each beside the same burst without the fault. Prints
-what the fault costs, what the verdict is made of, and the verdict. The exit status is 1 where an image that has lost
-more than 3 dB is good, or one of a burst without a fault is not.
+Bursts with the faults of Table 6 at its strengths and beyond them, each beside the same burst without the fault; or so
+many bursts drawn at random, a quarter of them without a fault. Prints what the fault costs, of that which both show,
+what the verdict is made of, and the verdict; at the end, how often each verdict fell at each loss. The exit status is 1
+where an image that has lost more than 3 dB is good, or one of a burst without a fault is not.
 """
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from numpy.typing import NDArray
+from skimage.metrics import peak_signal_noise_ratio
 
 from benchmarks.cases import Case
-from benchmarks.compare import score
-from benchmarks.methods import Outcome
+from benchmarks.unseen import FAULTY_EACH, unseen
+from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.pipeline import diagnose as judging
 from napari_fiberburst.pipeline.reconstruct import reconstruct
 from napari_fiberburst.pipeline.verdict import GoodnessOfFit, collect
+from napari_fiberburst.quality import match_levels
+from napari_fiberburst.simulation import SimulatedBurst
 
 MOST_LOSS = 3.0
 FAULTS: Mapping[str, Mapping[str, Any]] = {
@@ -55,6 +62,33 @@ HONEST: Mapping[str, Mapping[str, Any]] = {
 }
 
 
+# Losses, dB, that the last table tells apart.
+LOSSES: Mapping[str, float] = {"less than 1 dB": 1.0, "1 to 3 dB": MOST_LOSS, "more than 3 dB": float("inf")}
+VERDICTS = ("good", "doubtful", "bad")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Judged:
+    """An image and its verdict.
+
+    Attributes
+    ----------
+    image : numpy.ndarray
+        (H, W, C), 1 as full scale.
+    reference : int
+        The frame whose pixels it has.
+    verdict : str
+        "good", "doubtful" or "bad".
+    fit : GoodnessOfFit
+        What the verdict is made of.
+    """
+
+    image: NDArray[np.floating]
+    reference: int
+    verdict: str
+    fit: GoodnessOfFit
+
+
 def main() -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(
@@ -63,40 +97,78 @@ def main() -> int:
     parser.add_argument("--scenes", nargs="+", default=["histology", "tissue", "cat", "usaf"])
     parser.add_argument("--side", type=int, default=224)
     parser.add_argument("--only", nargs="+", help="names of faults; default all")
+    parser.add_argument("--unseen", type=int, metavar="N", help="instead, about N bursts drawn at random")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
     options = parser.parse_args()
-    wrong = 0
-    for scene in options.scenes:
-        base = Case(name="clean", scene=scene, side=options.side, pitch=4.7, channels=1, photons=8000.0)
-        best = float("nan")
-        for name, case, is_faulty in cases(base):
-            if options.only and name not in options.only:
-                continue
-            quality, verdict, fit = judged(case)
-            best = quality if name == "clean" else best
-            loss = best - quality if is_faulty else 0.0
-            is_wrong = (loss > MOST_LOSS and verdict == "good") or (not is_faulty and verdict != "good")
-            wrong += is_wrong
-            print(
-                f"{scene:10}{name:26}{quality:6.2f} dB, loses {loss:6.2f}  error {fit.error:.3f}  misfit "
-                f"{fit.misfit:6.2f}  uneven {fit.unevenness:5.2f}  structure {fit.structure:5.2f}  "
-                f"{verdict}{'  WRONG' if is_wrong else ''}",
-                flush=True,
-            )
-    print(f"{wrong} wrong")
+    if options.unseen is not None:
+        bursts = drawn_at_random(options.unseen, options.seed)
+    else:
+        bursts = (burst for scene in options.scenes for burst in of_table(scene, options.side, options.only))
+    return report(bursts)
+
+
+def report(bursts: Iterator[tuple[str, bool, SimulatedBurst, SimulatedBurst]]) -> int:
+    """Print each burst of name, whether it has a fault, itself and the one to hold it to, and what they come to."""
+    counts: Counter[tuple[str, str]] = Counter()
+    wrong: list[str] = []
+    twin: tuple[SimulatedBurst, Judged] | None = None
+    for name, is_faulty, simulated, clean in bursts:
+        try:
+            if twin is None or twin[0] is not clean:
+                twin = clean, judged(clean)
+            found = judged(simulated) if simulated is not clean else twin[1]
+        except FiberBurstError as error:
+            print(f"{name:60}refused: {error}", flush=True)
+            continue
+        quality = fidelity(found, simulated, simulated.visible)
+        loss = fidelity(twin[1], clean, simulated.visible) - quality if is_faulty else 0.0
+        row = next(text for text, most in LOSSES.items() if loss <= most) if is_faulty else "no fault"
+        counts[row, found.verdict] += 1
+        fit = found.fit
+        line = (
+            f"{name:60}{quality:6.2f} dB, loses {loss:6.2f}  error {fit.error:.3f}  halves {fit.disagreement:.3f}  "
+            f"misfit {fit.misfit:6.2f}  uneven {fit.unevenness:5.2f}  peak {fit.peak:5.2f}  "
+            f"structure {fit.structure:5.2f}  still {fit.still:5.2f}  {found.verdict}"
+        )
+        is_wrong = (loss > MOST_LOSS and found.verdict == "good") or (not is_faulty and found.verdict != "good")
+        if is_wrong:
+            wrong.append(line)
+        print(f"{line}{'  WRONG' if is_wrong else ''}", flush=True)
+    print(f"\n{'loss':16}" + "".join(f"{verdict:>10}" for verdict in VERDICTS))
+    for row in ("no fault", *LOSSES):
+        print(f"{row:16}" + "".join(f"{counts[row, verdict]:10}" for verdict in VERDICTS))
+    print("\n".join(["", f"{len(wrong)} wrong", *wrong]))
     return 1 if wrong else 0
 
 
-def cases(base: Case) -> Iterator[tuple[str, Case, bool]]:
-    """Yield name, burst, and whether something is wrong with it."""
+def of_table(
+    scene: str, side: int, only: list[str] | None
+) -> Iterator[tuple[str, bool, SimulatedBurst, SimulatedBurst]]:
+    """Yield the bursts of the table with one scene, as `report` takes them."""
+    base = Case(name="clean", scene=scene, side=side, pitch=4.7, channels=1, photons=8000.0)
+    clean = base.make()
     for name, faults in FAULTS.items():
-        yield name, replace(base, name=name, faults=faults), bool(faults)
+        if not only or name in only:
+            yield f"{scene}, {name}", bool(faults), replace(base, faults=faults).make() if faults else clean, clean
     for name, change in HONEST.items():
-        yield name, replace(base, name=name, **change), False
+        if not only or name in only:
+            hard = replace(base, **change).make()
+            yield f"{scene}, {name}", False, hard, hard
 
 
-def judged(case: Case) -> tuple[float, str, GoodnessOfFit]:
-    """Return PSNR, verdict and what it is made of."""
-    simulated = case.make()
+def drawn_at_random(count: int, seed: int) -> Iterator[tuple[str, bool, SimulatedBurst, SimulatedBurst]]:
+    """Yield bursts that no limit was tuned on, as `report` takes them."""
+    for number in range(-(-count // (1 + FAULTY_EACH))):
+        drawn, faulty = unseen(seed + number)
+        clean = drawn.make({})
+        print(drawn, flush=True)
+        yield "  clean", False, clean, clean
+        for name, faults in faulty:
+            yield f"  {name}", True, drawn.make(faults), clean
+
+
+def judged(simulated: SimulatedBurst) -> Judged:
+    """Return image, verdict and what it is made of."""
     kept: list[GoodnessOfFit] = []
 
     def keep(*arguments: Any) -> GoodnessOfFit:
@@ -107,8 +179,20 @@ def judged(case: Case) -> tuple[float, str, GoodnessOfFit]:
         result = reconstruct(simulated.burst)
     image = np.nan_to_num(result.image if result.image.ndim == 3 else result.image[..., None])
     scale = simulated.burst.white_level - simulated.burst.black_level
-    outcome = Outcome(image=image / scale, seconds=result.seconds, homographies=result.homographies)
-    return float(score(outcome, simulated)["psnr"]), str(result.quality), kept[-1]
+    return Judged(
+        image=image / scale,
+        reference=int(np.flatnonzero(np.isfinite(result.homographies).all(axis=(1, 2)))[0]),
+        verdict=str(result.quality),
+        fit=kept[-1],
+    )
+
+
+def fidelity(found: Judged, simulated: SimulatedBurst, visible: NDArray[np.bool_] | None) -> float:
+    """Return PSNR of the pixels that are visible (H, W), all where None; in dB, after one gain and offset a channel."""
+    truth = simulated.truth[found.reference].astype(np.float64)
+    seen = np.ones(truth.shape[:2], dtype=bool) if visible is None else visible
+    matched = match_levels(found.image[seen][None], truth[seen][None])
+    return float(peak_signal_noise_ratio(truth[seen][None], matched, data_range=1))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """Whether an image can be trusted: what the burst itself says against the model that the image rests on.
 
-Every criterion holds what the model leaves unexplained against what noise and an honest fit leave. The limits are those
-that tell simulated bursts which lose more than 3 dB by a fault from bursts without one (`benchmarks/verdicts.py`).
+Every criterion holds what the model leaves unexplained against what noise and an honest fit leave. Errors are parts of
+how much the object changes in the samples as it moves, because the bundle's own pattern, a dark rim or burned-in marks
+are contrast that any image explains. The limits are those that tell simulated bursts which lose more than 3 dB by a
+fault from bursts without one (`benchmarks/verdicts.py`).
 """
 
 from dataclasses import dataclass, replace
@@ -12,57 +14,85 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.results.diagnostics import Quality
+from napari_fiberburst.scene.halves import disagreement
 from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import Scene
 
-# Error of samples that were left out, without the noise, as a part of the samples' standard deviation. It is this many
-# times as large where the noise is not known, and is in it; and grows as frames get fewer than this, because their
-# samples leave gaps.
-_DOUBTFUL_ERROR, _BAD_ERROR = 0.11, 0.22
-_WITH_NOISE, _ENOUGH_FRAMES = 3.0, 8
+# Error of samples that were left out, as a part of what the object changes in them. It grows as frames get fewer than
+# the third number, because their samples leave gaps; where samples are pixels there are none.
+_DOUBTFUL_ERROR, _BAD_ERROR, _ENOUGH_FRAMES = 0.18, 0.4, 14
+# What noise is left in errors of pixels is told from those alone.
+_DOUBTFUL_PIXELS = 0.3
+# Disagreement of the first half of the frames with the second, in the same parts.
+_DISAGREEMENT = 0.25
+# Residuals of at most this many standard deviations of the noise are noise, however little of the object is seen.
+_NOISE_ALONE = 1.07
 # Cores' gains are not known better than to this part, so errors of this part of the light are to be expected.
 _GAIN_ERROR = 0.01
-# Ratio of the residuals of blurred frames to those of sharp ones: upper to lower quartile.
-_UNEVEN_FRAMES = 1.5
-# Correlation of residuals of neighbouring cores.
-_STRUCTURE = 0.12
+# Below this part of the error that is allowed, signs of single faults do not matter.
+_SMALL_ERROR = 0.5
+# Ratio of the residuals of blurred frames to those of sharp ones, upper to lower quartile, less 1; it grows as frames
+# get fewer, as above.
+_UNEVEN_FRAMES = 0.5
+# Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
+# edges stand out in it, so it grows with the square of the above.
+_UNEVEN_CORES, _WORST = 9.0, 0.99
+# Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
+# that are blurred in different directions make it negative, because an edge is then too bright on one side and too
+# dark on the other.
+_STRUCTURE, _BLURRED = 0.12, -0.03
+# Power of what stands still in the residuals, 1 for noise.
+_STILL_PATTERN = 2.2
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
 _SHORT_TRAVEL = 0.4
 # Frames that take part, at least; and as a part of all.
 _FEW_FRAMES, _LEAST_USED = 4, 0.5
-# In pitches, the distance within which cores are neighbours.
-_NEIGHBOURS = 1.4
+# In pitches, or pixels where these are the samples, the distance within which samples are neighbours; so many pairs of
+# them are enough.
+_NEIGHBOURS, _PAIRS = 1.4, 30_000
+# Frames that a core is seen in, at least, where its residuals are held against one another.
+_LEAST_FRAMES = 3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GoodnessOfFit:
     """What a verdict is made of; NaN where it is not known.
 
     Attributes
     ----------
     error : float
-        Root mean square error of samples left out of the fit, without the noise and what the gains' errors make of the
-        light, over the samples' standard deviation.
+        Root mean square error of samples left out of the fit, as a part of how much the object changes in samples as
+        it moves, both without the noise.
+    disagreement : float
+        Half the difference of the scenes that two halves of the burst show, in the same parts.
     misfit : float
         Root mean square of the residuals in standard deviations of the noise: 1 for a perfect model (the root of the
         reduced chi-square).
     frame_misfit : tuple of float
         The same for every frame.
+    core_misfit : numpy.ndarray
+        (N,) float32, the same for every sample's place: every core, or every pixel where these are the samples.
     structure : float
-        Correlation of the residuals of neighbouring cores, what all frames have alike left out: 0 for a perfect model.
+        Correlation of the residuals of neighbouring samples, what all frames have alike left out: 0 for noise.
+    still : float
+        Power of what the residuals of a place have alike in all frames, over what noise as strong as their changes
+        would leave there: 1 for noise, less where gains were fitted.
+    is_noise_known : bool
+        Whether the noise was measured. Otherwise misfits are relative to 1 at full scale, and noise is what
+        neighbouring samples do not share.
     """
 
     error: float
+    disagreement: float
     misfit: float
     frame_misfit: tuple[float, ...]
+    core_misfit: NDArray[np.float32]
     structure: float
-
-    @property
-    def is_noise_known(self) -> bool:
-        """Whether the noise has been taken out of `error`."""
-        return bool(np.isfinite(self.misfit))
+    still: float
+    is_noise_known: bool
 
     @property
     def unevenness(self) -> float:
@@ -72,6 +102,13 @@ class GoodnessOfFit:
             return float("nan")
         low, high = np.quantile(known, [0.25, 0.75])
         return float(high / low)
+
+    @property
+    def peak(self) -> float:
+        """Misfit of the worst cores over that of a typical one."""
+        known = self.core_misfit[np.isfinite(self.core_misfit)]
+        typical = float(np.median(known)) if len(known) else 0.0
+        return float(np.quantile(known, _WORST)) / typical if typical > 0 else float("nan")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,6 +127,32 @@ class Verdict:
     reasons: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Residuals:
+    """What a scene leaves of samples in grey.
+
+    Attributes
+    ----------
+    off : Tensor
+        (T, N), 0 where there is no sample.
+    known : Tensor
+        (T, N) bool.
+    """
+
+    off: Tensor
+    known: Tensor
+
+    @property
+    def still(self) -> Tensor:
+        """What all frames have alike, (N,)."""
+        return self.off.sum(dim=0) / self.known.sum(dim=0).clamp_min(1)
+
+    @property
+    def changing(self) -> Tensor:
+        """The rest, (T, N)."""
+        return torch.where(self.known, self.off - self.still, 0.0)
+
+
 def collect(scene: Scene, registration: Registration, variance: Tensor | None) -> GoodnessOfFit:
     """Return what the samples say of the scene that was solved from them.
 
@@ -101,31 +164,34 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
         (T, N) of the noise of one channel of `scene.samples`, full scale 1; None where it is not known.
     """
     samples = scene.samples
-    points = registration.points(samples.positions)
-    off = torch.full_like(samples.weights, torch.nan)
-    for frame, values, light, weights in predict(samples, points, scene.grid, scene.filtered):
-        off[frame] = torch.where(weights > 0, (values - light).mean(dim=1), torch.nan)
-    known = torch.isfinite(off)
-    mass = samples.weights * known
-    total = mass.sum().clamp_min(1e-9)
-    contrast = float(replace(samples, weights=mass).contrast)
-    noise = 0.0 if variance is None else float((mass * variance).sum() / total)
-    held_out = float("nan") if scene.held_out_rmse is None else scene.held_out_rmse
-    expected = noise + float((mass * (_GAIN_ERROR * samples.grey) ** 2).sum() / total)
-    error = max(held_out**2 - expected, 0.0) ** 0.5 / max(contrast, 1e-9) if held_out == held_out else held_out
     channels = samples.values.shape[2]
-    scaled = off.square() * (1.0 if variance is None else channels / variance.clamp_min(1e-12))
-    counts = known.sum(dim=1)
-    per_frame = torch.where(known, scaled, 0.0).sum(dim=1) / counts.clamp_min(1)
+    points = registration.points(samples.positions)
+    left = _residuals(scene, points)
+    shared, structure = _neighbours(left, samples)
+    mass = samples.weights * left.known
+    if variance is None:
+        alone = _mean(mass, left.changing.square()) - max(shared, 0.0)
+        noise = channels * max(alone, 0.0)
+    else:
+        noise = _mean(mass, variance)
+    changed = _change(replace(samples, weights=mass)) - noise / channels
+    change = changed**0.5 if changed > 0 else float("nan")  # the noise hides all that the object does
+    expected = noise + _GAIN_ERROR**2 * _mean(mass, samples.grey.square())
+    error = float("nan") if scene.held_out_rmse is None else max(scene.held_out_rmse**2 - expected, 0.0) ** 0.5
+    scaled = left.off.square() * (1.0 if variance is None else channels / variance.clamp_min(1e-12))
+    of_frames, of_cores = (_root_mean(scaled, left.known, over=axis) for axis in (1, 0))
+    halves = float("nan")
+    if not registration.is_still:
+        halves = disagreement(samples, points, np.flatnonzero(registration.used))
     return GoodnessOfFit(
-        error=error,
-        misfit=float("nan") if variance is None else float(scaled[known].mean().sqrt()),
-        frame_misfit=tuple(
-            float(value) ** 0.5 if count else float("nan") for value, count in zip(per_frame, counts, strict=True)
-        ),
-        structure=_structure(off.cpu().numpy(), samples.positions.cpu().numpy(), _NEIGHBOURS * samples.pitch)
-        if samples.kind == "cores"
-        else float("nan"),
+        error=error / change,
+        disagreement=halves / change,
+        misfit=float("nan") if variance is None else float(scaled[left.known].mean().sqrt()),
+        frame_misfit=tuple(of_frames.tolist()),
+        core_misfit=of_cores.cpu().numpy().astype(np.float32),
+        structure=structure,
+        still=_still_power(left),
+        is_noise_known=variance is not None,
     )
 
 
@@ -147,19 +213,39 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
-    allowed = (1.0 if fit.is_noise_known else _WITH_NOISE) * max(1.0, _ENOUGH_FRAMES / max(1, used))
-    if not registration.is_still and fit.error > _DOUBTFUL_ERROR * allowed:
-        is_bad = fit.error > _BAD_ERROR * allowed
+    gaps = max(1.0, _ENOUGH_FRAMES / max(1, used))
+    # NaN, a misfit that is not known, is no reason to take it for noise.
+    is_more_than_noise = not registration.is_still and not fit.misfit <= _NOISE_ALONE
+    allowed = _DOUBTFUL_ERROR * gaps if fit.is_noise_known else _DOUBTFUL_PIXELS
+    is_material = fit.error > _SMALL_ERROR * allowed
+    if is_more_than_noise and fit.error > allowed:
+        is_bad = fit.error > allowed * _BAD_ERROR / _DOUBTFUL_ERROR
         reasons.append(
-            f"samples that were left out are missed by {100 * fit.error:.0f} % of their contrast: the object "
+            f"samples that were left out are missed by {100 * fit.error:.0f} % of what changes in them: the object "
             "moves or changes in other ways than by the motion that was found"
         )
-    if fit.structure > _STRUCTURE:
+    if is_more_than_noise and fit.disagreement > _DISAGREEMENT * gaps:
+        reasons.append(
+            "the first half of the frames shows another image than the second half: the object, or how the frames look "
+            "at it, has changed"
+        )
+    if fit.still > _STILL_PATTERN:
+        reasons.append(
+            "a pattern that stands still in all frames is not explained: a bundle that was not found, light of the "
+            "bundle itself, or an object that was held for one"
+        )
+    if fit.is_noise_known and fit.structure > _STRUCTURE and is_material:
         reasons.append(
             "what the image leaves unexplained is alike in neighbouring cores, so something else than noise is in it"
         )
-    if fit.unevenness > _UNEVEN_FRAMES:
+    if fit.is_noise_known and fit.structure < _BLURRED:
+        reasons.append("edges are sharper in some frames than in others: the object moved while frames were exposed")
+    if fit.unevenness > 1 + _UNEVEN_FRAMES * gaps and is_material:
         reasons.append("many frames fit much worse than others: they are blurred, or out of focus")
+    if fit.is_noise_known and fit.peak > _UNEVEN_CORES * gaps**2 and is_material:
+        reasons.append(
+            "some cores fit much worse than others, such as those at a rim or under a mark: the image is wrong there"
+        )
     if count > 1 and used < max(2, _LEAST_USED * count):
         is_bad = is_bad or used < 2
         reasons.append(f"only {used} of {count} frames could be registered")
@@ -172,14 +258,52 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     return Verdict(quality=quality, reasons=tuple(reasons))
 
 
-def _structure(off: NDArray[np.float32], positions: NDArray[np.float32], reach: float) -> float:
-    """Return the correlation of residuals (T, N), each core's mean over the frames left out, between neighbours."""
-    known = np.isfinite(off)
-    pairs = cKDTree(positions).query_pairs(reach, output_type="ndarray")
-    if len(pairs) < 10 or len(off) < 3:
-        return float("nan")
-    values = np.where(known, off, 0.0).astype(np.float64)
-    values = np.where(known, values - values.sum(axis=0) / np.maximum(known.sum(axis=0), 1), 0.0)
-    first, second = (values[:, pairs[:, side]] * known[:, pairs[:, 1 - side]] for side in (0, 1))
-    power = float(np.sqrt((first**2).sum() * (second**2).sum()))
-    return float((first * second).sum() / power) if power > 0 else float("nan")
+def _residuals(scene: Scene, points: Tensor) -> _Residuals:
+    samples = scene.samples
+    off = torch.zeros_like(samples.weights)
+    known = torch.zeros_like(samples.weights, dtype=torch.bool)
+    for frame, values, light, weights in predict(samples, points, scene.grid, scene.filtered):
+        known[frame] = weights > 0
+        off[frame] = torch.where(known[frame], (values - light).mean(dim=1), 0.0)
+    return _Residuals(off=off, known=known)
+
+
+def _mean(mass: Tensor, values: Tensor) -> float:
+    return float((mass * values).sum() / mass.sum().clamp_min(1e-9))
+
+
+def _change(samples: Samples) -> float:
+    """Return the variance of what samples change from frame to frame, full scale 1."""
+    mean = (samples.weights * samples.grey).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
+    return _mean(samples.weights, (samples.grey - mean).square())
+
+
+def _root_mean(squares: Tensor, known: Tensor, *, over: int) -> Tensor:
+    """Return the root of the mean of squares (T, N) that are known, along an axis; NaN where none is."""
+    counts = known.sum(dim=over)
+    means = torch.where(known, squares, 0.0).sum(dim=over) / counts.clamp_min(1)
+    return torch.where(counts > 0, means.sqrt(), torch.nan)
+
+
+def _neighbours(left: _Residuals, samples: Samples) -> tuple[float, float]:
+    """Return covariance and correlation of what changes in residuals of neighbouring samples; NaN where too few are."""
+    reach = _NEIGHBOURS * (samples.pitch if samples.kind == "cores" else 1.0)
+    pairs = cKDTree(samples.positions.cpu().numpy()).query_pairs(reach, output_type="ndarray")
+    if len(pairs) < 10 or len(left.off) < _LEAST_FRAMES:
+        return float("nan"), float("nan")
+    first, second = torch.from_numpy(pairs[:: -(-len(pairs) // _PAIRS)].T.copy()).to(left.off.device)
+    both = left.known[:, first] & left.known[:, second]
+    one, other = (torch.where(both, left.changing[:, part], 0.0).double() for part in (first, second))
+    product, power = float((one * other).sum()), float((one.square().sum() * other.square().sum()).sqrt())
+    if power <= 0:
+        return float("nan"), float("nan")
+    return product / int(both.sum()), product / power
+
+
+def _still_power(left: _Residuals) -> float:
+    """Return how much stronger what stands still in the residuals is than noise would leave it."""
+    counts = left.known.sum(dim=0)
+    often = counts >= _LEAST_FRAMES
+    expected = left.changing.square().sum(dim=0)[often] / (counts[often] - 1)
+    total = float(expected.sum())
+    return float((left.still.square() * counts)[often].sum()) / total if total > 0 else float("nan")
