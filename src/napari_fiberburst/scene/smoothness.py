@@ -13,7 +13,7 @@ from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import ring_correlation
 from napari_fiberburst.scene.prediction import misfit
-from napari_fiberburst.scene.spline import NormalEquations
+from napari_fiberburst.scene.spline import NormalEquations, assemble
 
 # Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
 _CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
@@ -22,8 +22,6 @@ _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
 _REFERENCE = 0.01
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
-# Of conjugate gradients for each candidate, at most.
-_ITERATIONS = 40
 # Smoothness is chosen in a window of at most this many nodes a side.
 _WINDOW = 224
 # Every core is left out once, with so many others that most of its neighbours stay.
@@ -67,22 +65,25 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = _window(grid, scene)
-    grey = samples.values.mean(dim=2, keepdim=True)
-    halves = []
-    for chosen in (frames[::2], frames[1::2]):
-        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
-        for number in chosen:
-            normal = normal.with_samples(points[number], grey[number], samples.weights[number])
-        halves.append(normal)
+    in_grey = replace(samples, values=samples.grey[..., None])
+    halves = [assemble(window, in_grey, points, _among(half, samples)) for half in (frames[::2], frames[1::2])]
     densities = [blur(half.density(), 3.0) for half in halves]
     both = torch.minimum(*densities)
     sampled = (both > 0.2 * both.max()) & (both > 0)
     if not bool(sampled.any()):
         return Smoothness(UNTOLD, None)
-    found = _Halves(halves, sampled).searched()
-    weight, nearest = _lowest(np.array([step.risk for step in found]), tuple(step.smoothness for step in found))
+    paths = [
+        [half.image(scene, smoothness) for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)]
+        for half in halves
+    ]
+    reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
+    risks = [
+        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, sampled].mean())
+        for first, second in zip(*paths, strict=True)
+    ]
+    weight, nearest = _lowest(np.array(risks), _CANDIDATES)
     soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
-    first, second = (image[0].cpu().numpy() for image in found[nearest].images)
+    first, second = (path[nearest][0].cpu().numpy() for path in paths)
     resolution = window.spacing * ring_correlation(first, second, soft).resolution
     return Smoothness(weight, resolution if math.isfinite(resolution) else None)
 
@@ -99,84 +100,23 @@ def choose_among_neighbours(
     Parameters are those of `choose_smoothness`; one frame is enough.
     """
     window = _window(grid, scene)
-    grey = samples.values.mean(dim=2, keepdim=True)
-    in_grey = replace(samples, values=grey)
-    taking_part = torch.zeros(len(grey), dtype=torch.bool)
-    taking_part[torch.from_numpy(frames)] = True
-    fold = torch.randperm(grey.shape[1], generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
+    in_grey, taking_part = replace(samples, values=samples.grey[..., None]), _among(frames, samples)
+    count = samples.weights.shape[1]
+    fold = torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
     risks = np.zeros(len(_STILL_CANDIDATES))
     for left in range(_FOLDS):
-        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
-        for number in frames:
-            normal = normal.with_samples(points[number], grey[number], samples.weights[number] * (fold != left))
-        asked = taking_part.to(fold.device)[:, None] & (fold == left)
+        normal = assemble(window, in_grey, points, taking_part & (fold != left))
+        asked = taking_part & (fold == left)
         for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
             risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]
     return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """Both halves' scenes at one smoothness.
-
-    Attributes
-    ----------
-    smoothness : float
-        Which.
-    scenes, images : tuple of Tensor
-        (1, H, W) each half's coefficients, and the smooth image that they stand for.
-    risk : float
-        Error of the images, plus a constant; NaN until the reference is known.
-    """
-
-    smoothness: float
-    scenes: tuple[Tensor, Tensor]
-    images: tuple[Tensor, Tensor]
-    risk: float = math.nan
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Halves:
-    """The halves of a burst, and where both have looked, (H, W) bool."""
-
-    equations: list[NormalEquations]
-    sampled: Tensor
-
-    def searched(self) -> list[_Candidate]:
-        """Return neighbouring candidates from smooth to rough, the best one among them, and not at the end if it can.
-
-        The risk has one lowest place, so the search ends where it rises to both sides. It starts where most bursts end:
-        the smoothest candidates take the most iterations and the roughest are the least use.
-        """
-        first, reference = _CANDIDATES.index(UNTOLD), _CANDIDATES.index(_REFERENCE)
-        found: list[_Candidate] = []
-        start = tuple(half.mean() for half in self.equations)
-        for index in range(first, reference + 1):
-            found.append(self._solved(_CANDIDATES[index], start))
-            start = found[-1].scenes
-        truth = found[-1].images
-        found = [self._judged(candidate, truth) for candidate in found]
-        last = reference
-        while found[-1].risk <= min(step.risk for step in found) and last + 1 < len(_CANDIDATES):
-            last += 1
-            found.append(self._judged(self._solved(_CANDIDATES[last], found[-1].scenes), truth))
-        while found[0].risk <= min(step.risk for step in found) and first > 0:
-            first -= 1
-            found.insert(0, self._judged(self._solved(_CANDIDATES[first], found[0].scenes), truth))
-        return found
-
-    def _solved(self, smoothness: float, start: tuple[Tensor, ...]) -> _Candidate:
-        one, other = (
-            half.solve(smoothness, scene, _ITERATIONS) for half, scene in zip(self.equations, start, strict=True)
-        )
-        first, second = self.equations
-        return _Candidate(smoothness, (one, other), (first.image(one, smoothness), second.image(other, smoothness)))
-
-    def _judged(self, candidate: _Candidate, truth: tuple[Tensor, Tensor]) -> _Candidate:
-        """Return the candidate with its risk: each half's image is held to the other half's nearly unbiased one."""
-        (first, second), (one, other) = candidate.images, truth
-        risk = float(((first - other) ** 2 + (second - one) ** 2)[:, self.sampled].mean())
-        return replace(candidate, risk=risk)
+def _among(frames: NDArray[np.intp], samples: Samples) -> Tensor:
+    """Return which samples are of these frames, (T, 1) bool."""
+    among = torch.zeros(len(samples.weights), 1, dtype=torch.bool)
+    among[torch.from_numpy(frames)] = True
+    return among.to(samples.weights.device)
 
 
 def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor]:
@@ -184,7 +124,7 @@ def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor
     scene = normal.mean()
     scenes = []
     for smoothness in candidates:
-        scene = normal.solve(smoothness, scene, _ITERATIONS)
+        scene = normal.solve(smoothness, scene, 40)
         scenes.append(scene)
     return scenes
 
