@@ -22,8 +22,6 @@ _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
 _REFERENCE = 0.01
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
-# Of conjugate gradients, at most: for a usual scene and rougher ones, and for smoother ones.
-_ITERATIONS, _SMOOTHER_ITERATIONS = 40, 16
 # Smoothness is chosen in a window of at most this many nodes a side.
 _WINDOW = 224
 # Every core is left out once, with so many others that most of its neighbours stay.
@@ -122,17 +120,13 @@ def _among(frames: NDArray[np.intp], samples: Samples) -> Tensor:
 
 
 def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor]:
-    """Return the scenes of all candidates, each started from its neighbour: first the usual one, then outwards.
-
-    A smoother scene is nearer to a rough one than to an even one, so it takes few iterations.
-    """
-    usual = candidates.index(UNTOLD)
-    scenes = {usual: normal.solve(UNTOLD, normal.mean(), _ITERATIONS)}
-    for index in range(usual - 1, -1, -1):
-        scenes[index] = normal.solve(candidates[index], scenes[index + 1], _SMOOTHER_ITERATIONS)
-    for index in range(usual + 1, len(candidates)):
-        scenes[index] = normal.solve(candidates[index], scenes[index - 1], _ITERATIONS)
-    return [scenes[index] for index in range(len(candidates))]
+    """Return the scenes of all candidates, each started from the smoother one before."""
+    scene = normal.mean()
+    scenes = []
+    for smoothness in candidates:
+        scene = normal.solve(smoothness, scene, 40)
+        scenes.append(scene)
+    return scenes
 
 
 def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> tuple[float, int]:
