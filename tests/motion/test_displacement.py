@@ -70,3 +70,18 @@ def test_a_displacement_moves_with_its_points():
     for number, offset in enumerate(offsets):
         there = moved.at(points + offset.float())[number]
         torch.testing.assert_close(there, bends.at(points)[number], atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_weights_of_control_points_are_a_matrix_and_its_transpose(dtype):
+    grid = ControlGrid(8.0, (7, 9))
+    generator = torch.Generator().manual_seed(0)
+    # All on one side, so that some control points have no place near them.
+    places = 20 * torch.rand(53, 2, generator=generator, dtype=dtype)
+    weights, (index, entries) = grid.at(places), grid.splines(places)
+    matrix = torch.zeros(53, 63, dtype=dtype).scatter_add_(1, index, entries)
+    assert bool((matrix == 0).all(dim=0).any())
+    control, values = (torch.randn(3, 2, count, generator=generator, dtype=dtype) for count in (63, 53))
+    torch.testing.assert_close(weights(control), control @ matrix.T)
+    torch.testing.assert_close(weights.adjoint(values), values @ matrix)
+    torch.testing.assert_close(weights.normal_diagonal(values), values @ matrix.square())

@@ -62,11 +62,11 @@ def operators_to_test():
         for through in (None, footprint):
             blocks = (scene, random(FRAMES, dof), random(CORES), random(FRAMES))
             name = f"joint jacobian of {dof} generators, {'points' if through is None else 'footprints'}"
-            yield name, jacobian(GeneratorSlopes(random(FRAMES, SAMPLES, dof)), through), blocks, samples
+            yield name, jacobian(GeneratorSlopes(random(FRAMES, dof, SAMPLES)), through), blocks, samples
     controls = ControlGrid(8.0, (7, 9))
     weights = controls.at(points(SAMPLES).nan_to_num(3.0))
     yield "control points", weights, random(FRAMES, 2, 63), random(FRAMES, 2, SAMPLES)
-    yield "slopes along generators", GeneratorSlopes(random(FRAMES, SAMPLES, 8)), random(FRAMES, 8), samples
+    yield "slopes along generators", GeneratorSlopes(random(FRAMES, 8, SAMPLES)), random(FRAMES, 8), samples
     bending = ControlSlopes(random(FRAMES, SAMPLES), random(FRAMES, SAMPLES), weights)
     blocks = (scene, random(FRAMES, 2, 63), random(CORES), random(FRAMES))
     yield "slopes along control points", bending, random(FRAMES, 2, 63), samples

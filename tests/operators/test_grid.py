@@ -84,3 +84,25 @@ def test_a_footprint_is_a_disc_of_its_radius():
     spread = (kernel * (offset[:, None] ** 2 + offset[None, :] ** 2)).sum()
     assert float(spread) == pytest.approx(3.0**2 / 2, rel=0.05)  # second moment of an even disc
     assert float(footprint.transfer(torch.zeros(1), torch.zeros(1))) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(2, 2), (13, 2), (31, 37)])
+def test_reading_is_the_mean_of_four_nodes_by_nearness_up_to_the_edges(shape, dtype):
+    rows, columns = shape
+    at = Grid(-3.0, 2.0, 1.3, shape)
+    inner = torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    places = torch.cat([inner, torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=dtype)])
+    places = places * torch.tensor([columns - 1, rows - 1], dtype=dtype)
+    images = torch.randn(3, *shape, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    sampling = at.at(places * 1.3 + torch.tensor([-3.0, 2.0], dtype=dtype))
+    inside = sampling.inside
+    assert inside[:50].all()
+    j, i = (part.floor().long().clamp(max=side - 2) for part, side in zip(places.T, (columns, rows), strict=True))
+    x, y = places[:, 0] - j, places[:, 1] - i
+    upper = (1 - x) * images[:, i, j] + x * images[:, i, j + 1]
+    lower = (1 - x) * images[:, i + 1, j] + x * images[:, i + 1, j + 1]
+    expected = ((1 - y) * upper + y * lower) * inside
+    tolerance = {torch.float32: 2e-5, torch.float64: 1e-12}[dtype]
+    torch.testing.assert_close(sampling.of_channels(images), expected.T, rtol=0, atol=tolerance)
+    torch.testing.assert_close(sampling(images[0]), expected[0], rtol=0, atol=tolerance)

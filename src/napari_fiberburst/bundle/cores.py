@@ -112,11 +112,10 @@ def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitc
     place = np.asarray(distance) / (_PROFILE_STEP * pitch)
     knots = math.ceil(_PROFILE_REACH / _PROFILE_STEP) + 1
     below = np.minimum(place.astype(int), knots)
-    design = np.zeros((len(x), knots + 2))
-    pixel = np.broadcast_to(np.arange(len(x))[:, None], place.shape)
+    entry = np.arange(len(x))[:, None] * (knots + 2) + below
     gain = gains[nearest]
-    np.add.at(design, (pixel, below), gain * (1 - place + below).clip(0, 1))
-    np.add.at(design, (pixel, below + 1), gain * (place - below).clip(0, 1))
+    parts = np.stack([gain * (1 - place + below).clip(0, 1), gain * (place - below).clip(0, 1)])
+    design = np.bincount(np.stack([entry, entry + 1]).ravel(), parts.ravel(), len(x) * (knots + 2)).reshape(len(x), -1)
     profile, _ = nnls(design[:, :knots], transmission.cpu().numpy()[y, x].astype(np.float64))
     radius = np.linspace(0, _OWN_REACH, 200)
     light = np.interp(radius, np.arange(knots) * _PROFILE_STEP, profile) ** _MOMENT_POWER

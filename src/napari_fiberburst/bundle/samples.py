@@ -154,10 +154,18 @@ class BundleTensors:
         return values if values.shape[1] in (1, channels) else values.mean(dim=1, keepdim=True)
 
 
+def in_grey(frames: Tensor) -> Tensor:
+    """Return frames (..., C) averaged over channels, (...), several times as fast as torch does over a last axis."""
+    first, *others = frames.unbind(dim=-1)
+    total: Tensor = sum(others, first)
+    return total / frames.shape[-1]
+
+
 def exposed(frames: Tensor) -> Tensor:
     """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
-    deviation = frames.std(dim=(1, 2))
-    bright = (frames >= SATURATED).float().mean(dim=(1, 2))
+    # Several times as fast as torch's own deviation over two axes.
+    deviation = (frames - frames.mean(dim=(1, 2), keepdim=True)).square().mean(dim=(1, 2)).sqrt()
+    bright = (frames >= SATURATED).sum(dim=(1, 2)) / frames[0].numel()
     good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
     return good if bool(good.any()) else torch.ones_like(good)
 
@@ -196,12 +204,12 @@ def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Sa
     """
     known = BundleTensors.of(bundle, acquisition, frames.device)
     count, channels = len(known.centres), frames.shape[-1]
-    labels, profile = known.labels[known.own], known.transmission[known.own]
+    own = known.own.flatten().nonzero()[:, 0]
+    labels, profile = known.labels.flatten()[own], known.transmission.flatten()[own]
     values = torch.zeros(len(frames), count, channels).to(frames)
     power = torch.zeros(len(frames), count).to(frames)
-    for number in exposed(frames.mean(dim=3)).nonzero()[:, 0].tolist():
-        frame = frames[number]
-        light = frame[known.own]
+    for number in exposed(in_grey(frames)).nonzero()[:, 0].tolist():
+        light = frames[number].flatten(0, 1).index_select(0, own)
         usable = profile * (light.amax(dim=1) < SATURATED)
         values[number].index_add_(0, labels, (light - known.black) * usable[:, None])
         power[number].index_add_(0, labels, usable * profile)
@@ -238,7 +246,7 @@ def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> S
         kind="pixels",
         positions=lit.nonzero().flip(1).to(frames.dtype),
         values=((light - known.black) / passed[:, None] - offsets) / gains,
-        weights=passed**2 * ((light.amax(dim=2) < SATURATED) & exposed(frames.mean(dim=3))[:, None]),
+        weights=passed**2 * ((light.amax(dim=2) < SATURATED) & exposed(in_grey(frames))[:, None]),
         core_index=labels,
         cores=len(known.centres),
         radius=None,

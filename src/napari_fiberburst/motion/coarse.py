@@ -7,6 +7,7 @@ long as some frames overlap. Fine, by `napari_fiberburst.motion.joint`.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -26,6 +27,8 @@ _LEAST_OVERLAP = 0.12
 _ALL_PAIRS = 20
 _NEIGHBOURS = 3
 _LANDMARKS = 8
+# Correlations with masks that are kept for other pairs, at most.
+_KEPT = 128
 # Brightness and contrast of the images are evened out over so many of their pixels (sigma of a Gaussian), contrast
 # where it is more than this part of the usual one.
 _NEIGHBOURHOOD, _LEAST_CONTRAST = 4.0, 0.5
@@ -156,23 +159,29 @@ class _Correlation:
         masks = masks.to(images.dtype)
         mass = masks.sum(dim=(1, 2), keepdim=True).clamp_min(1)
         centred = (images - (images * masks).sum(dim=(1, 2), keepdim=True) / mass) * masks
+        # Most bursts have one mask for all frames, so what is correlated with it serves many pairs.
+        numbers: dict[bytes, int] = {}
+        self._mask_of = [numbers.setdefault(mask.cpu().numpy().tobytes(), i) for i, mask in enumerate(masks)]
+        self._kept = lru_cache(maxsize=_KEPT)(self._correlate)
         self._area = masks.sum(dim=(1, 2))
         self._power = centred.square().sum(dim=(1, 2))
-        self._masks, self._values, self._squares = (
-            torch.fft.rfft2(part, s=self._shape) for part in (masks, centred, centred.square())
-        )
+        self._spectra = {
+            name: torch.fft.rfft2(part, s=self._shape)
+            for name, part in (("mask", masks), ("value", centred), ("square", centred.square()))
+        }
 
     def best(self, first: int, second: int) -> tuple[NDArray[np.float64], float]:
         """Return the shift (x, y) from the second image to the first, in their pixels, and its score."""
         area = torch.minimum(self._area[first], self._area[second])
         if not float(area) > 0:
             return np.zeros(2), 0.0
-        overlap = self._correlate(self._masks[first], self._masks[second]).clamp_min(1e-3)
-        sums = self._correlate(self._values[first], self._masks[second])
-        sums_second = self._correlate(self._masks[first], self._values[second])
-        power = self._correlate(self._squares[first], self._masks[second]) - sums**2 / overlap
-        power_second = self._correlate(self._masks[first], self._squares[second]) - sums_second**2 / overlap
-        joint = self._correlate(self._values[first], self._values[second]) - sums * sums_second / overlap
+        mask, mask_second = self._mask_of[first], self._mask_of[second]
+        overlap = self._kept("mask", mask, "mask", mask_second).clamp_min(1e-3)
+        sums = self._kept("value", first, "mask", mask_second)
+        sums_second = self._kept("mask", mask, "value", second)
+        power = self._kept("square", first, "mask", mask_second) - sums**2 / overlap
+        power_second = self._kept("mask", mask, "square", second) - sums_second**2 / overlap
+        joint = self._correlate("value", first, "value", second) - sums * sums_second / overlap
         # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
         share = overlap / area
         norm = (power.clamp_min(0) + 0.02 * share * self._power[first]) * (
@@ -186,8 +195,10 @@ class _Correlation:
             shift[axis] -= side if shift[axis] > side // 2 else 0
         return -np.array(shift, dtype=np.float64), max(0.0, float(score.max()))
 
-    def _correlate(self, first: Tensor, second: Tensor) -> Tensor:
-        correlated: Tensor = torch.fft.irfft2(first.conj() * second, s=self._shape)
+    def _correlate(self, part: str, first: int, part_second: str, second: int) -> Tensor:
+        """Return one part of an image correlated with another part of a second image, at every shift."""
+        spectrum = self._spectra[part][first].conj() * self._spectra[part_second][second]
+        correlated: Tensor = torch.fft.irfft2(spectrum, s=self._shape)
         return correlated
 
 

@@ -62,9 +62,9 @@ class RigidTerm:
 
     @classmethod
     def of(cls, slopes: GeneratorSlopes, weights: Tensor, damping: float) -> "RigidTerm":
-        """Return the term for samples of these slopes (T, N, k) and weights (T, N)."""
-        weighted = slopes.slopes * weights.unsqueeze(-1)
-        blocks = (weighted.mT @ slopes.slopes).cpu().double()
+        """Return the term for samples of these slopes and weights (T, N)."""
+        weighted = slopes.slopes * weights.unsqueeze(1)
+        blocks = (weighted @ slopes.slopes.mT).cpu().double()
         sizes = blocks.diagonal(dim1=1, dim2=2)
         floor = sizes * damping + sizes.mean() * 1e-6 + 1e-12
         return cls(floor.to(weights), torch.linalg.inv(blocks + torch.diag_embed(floor)).to(weights))
@@ -219,7 +219,7 @@ def linearise(problem: JointProblem, state: JointState, level: Level) -> JointJa
         motion = ControlSlopes(along_x, along_y, problem.controls)
     else:
         x, y = state.motion.tangent(points, min(level.dof, problem.dof))
-        motion = GeneratorSlopes(along_x.unsqueeze(-1) * x + along_y.unsqueeze(-1) * y)
+        motion = GeneratorSlopes(along_x.unsqueeze(1) * x + along_y.unsqueeze(1) * y)
     return JointJacobian(
         sampling=sampling,
         footprint=state.footprint,

@@ -135,13 +135,16 @@ class FrameMotion:
         return cls(torch.from_numpy(arrays["scene_from_frame"]), (int(height), int(width)), displacement)
 
     def tangent(self, points: Tensor, dof: int) -> tuple[Tensor, Tensor]:
-        """Return how scene points (..., 2) move, in pixels along x and y, per unit of each generator: (..., k)."""
+        """Return how scene points move, in pixels along x and y, per unit of each generator.
+
+        Points (..., N, 2) give (..., k, N).
+        """
         height, width = self.shape
         centre = torch.tensor([(width - 1) / 2, (height - 1) / 2])
         x, y = ((points - centre.to(points)) / self._half).unbind(dim=-1)
         one, zero = torch.ones_like(x), torch.zeros_like(x)
-        along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:dof], dim=-1)
-        along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:dof], dim=-1)
+        along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:dof], dim=-2)
+        along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:dof], dim=-2)
         return along_x * self._half, along_y * self._half
 
     def moved(self, steps: Tensor) -> "FrameMotion":

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
 # Unknowns in blocks of any shapes, such as a scene, the motion of its frames, and gains.
@@ -50,7 +51,8 @@ def conjugate_gradients(
     if start is None:
         solution, residual = tuple(part * 0 for part in rhs), rhs
     else:
-        solution, residual = start, _add(rhs, -1.0, multiply(start))
+        product = multiply(start)
+        solution, residual = start, tuple(part - other for part, other in zip(rhs, product, strict=True))
     search = ready = precondition(residual)
     power = inner(residual, ready)
     enough = tolerance**2 * (power if start is None else inner(rhs, precondition(rhs)))
@@ -79,5 +81,5 @@ def inner_of_images(first: Blocks, second: Blocks) -> Tensor:
     return (a * b).sum(dim=(-1, -2), keepdim=True)
 
 
-def _add(blocks: Blocks, factor: Tensor | float, others: Blocks) -> Blocks:
-    return tuple(part + factor * other for part, other in zip(blocks, others, strict=True))
+def _add(blocks: Blocks, factor: Tensor, others: Blocks) -> Blocks:
+    return tuple(torch.addcmul(part, factor, other) for part, other in zip(blocks, others, strict=True))

@@ -30,18 +30,18 @@ class GeneratorSlopes:
     Attributes
     ----------
     slopes : Tensor
-        (T, N, k).
+        (T, k, N), contiguous: products of rows with it are several times as fast as with columns.
     """
 
     slopes: Tensor
 
     def __call__(self, steps: Tensor) -> Tensor:
         """Return how the samples change by steps (T, k)."""
-        return (self.slopes @ steps.unsqueeze(-1)).squeeze(-1)
+        return (steps.unsqueeze(1) @ self.slopes).squeeze(1)
 
     def adjoint(self, values: Tensor) -> Tensor:
         """Return the adjoint of values (T, N): (T, k)."""
-        return (self.slopes.mT @ values.unsqueeze(-1)).squeeze(-1)
+        return (values.unsqueeze(1) @ self.slopes.mT).squeeze(1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,17 +31,17 @@ class Stencil:
         diagonal, right, below, below_right, below_left = self.bands
         y: Tensor = diagonal * x
         coupling = right[:, :-1]
-        y[..., :, :-1] += coupling * x[..., :, 1:]
-        y[..., :, 1:] += coupling * x[..., :, :-1]
+        y[..., :, :-1].addcmul_(coupling, x[..., :, 1:])
+        y[..., :, 1:].addcmul_(coupling, x[..., :, :-1])
         coupling = below[:-1]
-        y[..., :-1, :] += coupling * x[..., 1:, :]
-        y[..., 1:, :] += coupling * x[..., :-1, :]
+        y[..., :-1, :].addcmul_(coupling, x[..., 1:, :])
+        y[..., 1:, :].addcmul_(coupling, x[..., :-1, :])
         coupling = below_right[:-1, :-1]
-        y[..., :-1, :-1] += coupling * x[..., 1:, 1:]
-        y[..., 1:, 1:] += coupling * x[..., :-1, :-1]
+        y[..., :-1, :-1].addcmul_(coupling, x[..., 1:, 1:])
+        y[..., 1:, 1:].addcmul_(coupling, x[..., :-1, :-1])
         coupling = below_left[:-1, 1:]
-        y[..., :-1, 1:] += coupling * x[..., 1:, :-1]
-        y[..., 1:, :-1] += coupling * x[..., :-1, 1:]
+        y[..., :-1, 1:].addcmul_(coupling, x[..., 1:, :-1])
+        y[..., 1:, :-1].addcmul_(coupling, x[..., :-1, 1:])
         return y
 
     def adjoint(self, x: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
-from napari_fiberburst.bundle.samples import Samples, sample_cores, sample_pixels, shows_detail
+from napari_fiberburst.bundle.samples import Samples, in_grey, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
@@ -127,7 +127,7 @@ class Stages:
             )
         self._burst, self._method, self._seed, self._given = burst, method, seed, given
         self._frames = torch.from_numpy(burst.frames).to(device)
-        self._grey = self._frames.mean(dim=3)
+        self._grey = in_grey(self._frames)
 
     def align(self) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register; None until the bundle is known."""
@@ -148,7 +148,7 @@ class Stages:
         steadied: tuple[str, ...] = ()
         if mount is not None:
             self._frames = mount.steadied(torch.from_numpy(self._burst.frames).to(self._frames))
-            self._grey = self._frames.mean(dim=3)
+            self._grey = in_grey(self._frames)
             steadied = (_warned(mount.note),)
         yield None
         bundle, notes = yield from self._calibrate()

@@ -214,6 +214,10 @@ class _System:
     matrix: Array
     rhs: Array
 
+    def of_noise(self, variance: float) -> "_System":
+        """Return the equations were the noise of this variance."""
+        return _System(matrix=self.matrix / variance, rhs=self.rhs / variance)
+
 
 def _find_what_is_left(samples: Samples, registration: Registration) -> Shading | None:
     """Find the shading by one scene; None where it does not stand out of the noise."""
@@ -225,10 +229,15 @@ def _find_what_is_left(samples: Samples, registration: Registration) -> Shading 
     for _ in range(_PASSES):
         weights = ratios.weights * robust
         left = _left(ratios, weights, basis, solution)
-        system = _normal_equations(ratios, weights, left, basis)
+        channels = _channels(ratios, weights, basis)
+        system = _normal_equations(channels, left)
+        found, settled = priors.settled(system)
+        if not settled.stands_out(system, found):
+            return None  # most bursts: they end here after one pass
+        system = system.of_noise(_excess(channels, left))
         solution, priors = priors.settled(system)
         if not priors.stands_out(system, solution):
-            return None  # most bursts: they end here after one pass
+            return None
         left = _left(ratios, weights, basis, solution)
         sizes = torch.from_numpy(left * np.sqrt(ratios.weights))
         robust = huber(sizes, torch.from_numpy(ratios.weights)).numpy()
@@ -372,29 +381,40 @@ class _Channel:
         return np.maximum(self._sum_over_cells(self.weights), 1e-12)
 
 
-def _normal_equations(ratios: _Ratios, weights: Array, left: Array, basis: _Basis) -> _System:
-    """Set up the normal equations, divided by the variance of the noise.
+def _channels(ratios: _Ratios, weights: Array, basis: _Basis) -> list[_Channel]:
+    """Return the channels of ratios with other weights (T, N, C)."""
+    return [
+        _Channel(ratios=ratios, values=values, weights=own, basis=basis)
+        for values, own in zip(np.moveaxis(ratios.values, 2, 0), np.moveaxis(weights, 2, 0), strict=True)
+    ]
+
+
+def _normal_equations(channels: list[_Channel], left: Array) -> _System:
+    """Set up the normal equations, divided by the variance of the noise, as if all ratios were independent.
 
     The variance is that of what the last solution has left, (T, N, C), with one degree of freedom less for each cell.
-    Ratios of one core, and of one cell, are wrong alike, so they tell less than as many independent ones, by their
-    excess.
     """
-    frames, _, channels = ratios.values.shape
-    controls = basis.splines.shape[1]
-    size = channels * controls + frames
+    frames, controls = len(left), channels[0].basis.splines.shape[1]
+    size = len(channels) * controls + frames
     matrix, rhs = np.zeros((size, size)), np.zeros(size)
-    free, excess = 0, 1.0
-    for number in range(channels):
-        w = weights[..., number]
-        channel = _Channel(ratios=ratios, values=ratios.values[..., number], weights=w, basis=basis)
+    free, squares = 0, 0.0
+    for number, channel in enumerate(channels):
         own, own_rhs = channel.equations()
-        at = np.r_[number * controls : (number + 1) * controls, channels * controls : size]
+        at = np.r_[number * controls : (number + 1) * controls, len(channels) * controls : size]
         matrix[np.ix_(at, at)] += own
         rhs[at] += own_rhs
-        free += int((w > 0).sum()) - len(np.unique(ratios.cells[w > 0]))
-        excess = max(excess, *channel.excess(left[..., number]))
-    noise = max(float((weights * left**2).sum()) / max(free, 1) * excess, 1e-12)
-    return _System(matrix=matrix / noise, rhs=rhs / noise)
+        counted = channel.weights > 0
+        free += int(counted.sum()) - len(np.unique(channel.ratios.cells[counted]))
+        squares += float((channel.weights * left[..., number] ** 2).sum())
+    return _System(matrix=matrix, rhs=rhs).of_noise(max(squares / max(free, 1), 1e-12))
+
+
+def _excess(channels: list[_Channel], left: Array) -> float:
+    """Return by how much the variance is larger because ratios of one core, and of one cell, are wrong alike.
+
+    They tell less than as many independent ones; only a shading that would stand out of those is worth the asking.
+    """
+    return max(1.0, *(part for number, channel in enumerate(channels) for part in channel.excess(left[..., number])))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

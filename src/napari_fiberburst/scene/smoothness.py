@@ -13,7 +13,7 @@ from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import ring_correlation
 from napari_fiberburst.scene.prediction import misfit
-from napari_fiberburst.scene.spline import NormalEquations
+from napari_fiberburst.scene.spline import NormalEquations, assemble
 
 # Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
 _CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
@@ -65,13 +65,8 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = _window(grid, scene)
-    grey = samples.values.mean(dim=2, keepdim=True)
-    halves = []
-    for chosen in (frames[::2], frames[1::2]):
-        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
-        for number in chosen:
-            normal = normal.with_samples(points[number], grey[number], samples.weights[number])
-        halves.append(normal)
+    in_grey = replace(samples, values=samples.grey[..., None])
+    halves = [assemble(window, in_grey, points, _among(half, samples)) for half in (frames[::2], frames[1::2])]
     densities = [blur(half.density(), 3.0) for half in halves]
     both = torch.minimum(*densities)
     sampled = (both > 0.2 * both.max()) & (both > 0)
@@ -105,20 +100,23 @@ def choose_among_neighbours(
     Parameters are those of `choose_smoothness`; one frame is enough.
     """
     window = _window(grid, scene)
-    grey = samples.values.mean(dim=2, keepdim=True)
-    in_grey = replace(samples, values=grey)
-    taking_part = torch.zeros(len(grey), dtype=torch.bool)
-    taking_part[torch.from_numpy(frames)] = True
-    fold = torch.randperm(grey.shape[1], generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
+    in_grey, taking_part = replace(samples, values=samples.grey[..., None]), _among(frames, samples)
+    count = samples.weights.shape[1]
+    fold = torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
     risks = np.zeros(len(_STILL_CANDIDATES))
     for left in range(_FOLDS):
-        normal = NormalEquations.empty(window, samples.radius, 1, points.device)
-        for number in frames:
-            normal = normal.with_samples(points[number], grey[number], samples.weights[number] * (fold != left))
-        asked = taking_part.to(fold.device)[:, None] & (fold == left)
+        normal = assemble(window, in_grey, points, taking_part & (fold != left))
+        asked = taking_part & (fold == left)
         for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
             risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]
     return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
+
+
+def _among(frames: NDArray[np.intp], samples: Samples) -> Tensor:
+    """Return which samples are of these frames, (T, 1) bool."""
+    among = torch.zeros(len(samples.weights), 1, dtype=torch.bool)
+    among[torch.from_numpy(frames)] = True
+    return among.to(samples.weights.device)
 
 
 def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor]:

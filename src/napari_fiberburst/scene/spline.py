@@ -33,6 +33,8 @@ from napari_fiberburst.operators.stencil import Stencil
 # Relative error at which conjugate gradients end: far below the noise of any sample.
 _TOLERANCE = 1e-3
 _FREQUENCIES = 33
+# So many samples are assembled at once: enough that calls cost little, and few enough for any memory.
+_SAMPLES_TOGETHER = 200_000
 # Nodes with less than this part of the densest sampling are beyond what was seen.
 _LEAST_DENSITY = 0.05
 # Nodes repeated beyond the edge, so that a filter finds no step there.
@@ -68,7 +70,7 @@ class NormalEquations:
         )
 
     def with_samples(self, points: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
-        """Return the equations with samples at points (N, 2) of values (N, C) and weights (N,)."""
+        """Return the equations with samples at points (..., 2) of values (..., C) and weights (...)."""
         used = weights > 0
         sampling, values, weights = self.grid.at(points[used]), values[used], weights[used]
         rhs = torch.stack(
@@ -216,8 +218,9 @@ def assemble(grid: Grid, samples: Samples, points: Tensor, among: Tensor | None 
     `among` (T, N) multiplies the weights: 0 leaves samples out.
     """
     equations = NormalEquations.empty(grid, samples.radius, samples.values.shape[2], points.device)
-    for number, weights in enumerate(samples.weights):
-        if bool((weights > 0).any()):
-            chosen = weights if among is None else weights * among[number]
-            equations = equations.with_samples(points[number], samples.values[number], chosen)
+    weights = samples.weights if among is None else samples.weights * among
+    together = max(1, _SAMPLES_TOGETHER // max(1, weights.shape[1]))
+    for first in range(0, len(weights), together):
+        some = slice(first, first + together)
+        equations = equations.with_samples(points[some], samples.values[some], weights[some])
     return equations

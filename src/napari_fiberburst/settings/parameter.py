@@ -5,10 +5,11 @@ show that text, and every settings object refuses values out of range by the sam
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
+from functools import cache
 from numbers import Integral, Real
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from napari_fiberburst.errors import SettingsError
@@ -116,10 +117,16 @@ def parameter(
     return field(default=default, metadata={"doc": doc, "least": least, "above": above, "most": most})
 
 
-def parameters_of(settings_type: type) -> dict[str, Parameter]:
+def parameters_of(settings_type: type) -> Mapping[str, Parameter]:
     """Return the parameters of a settings class by name, in the order they are declared."""
+    return _parameters_of(settings_type)
+
+
+@cache
+def _parameters_of(settings_type: type) -> Mapping[str, Parameter]:
+    """Read them once: every settings object that is made is checked against them."""
     hints = get_type_hints(settings_type)
-    return {item.name: _read(item, hints[item.name]) for item in _declared(settings_type)}
+    return MappingProxyType({item.name: _read(item, hints[item.name]) for item in _declared(settings_type)})
 
 
 def check(settings: object) -> None:
