@@ -103,7 +103,7 @@ def _information(problem: JointProblem, state: JointState) -> Tensor:
     weights = weights * huber(residual, weights)
     variance = float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
     slopes = jacobian.motion.slopes
-    blocks = (slopes * weights.unsqueeze(-1)).mT @ slopes
+    blocks = (slopes * weights[:, None]) @ slopes.mT
     return blocks.cpu().double() / max(variance, 1e-12)
 
 
