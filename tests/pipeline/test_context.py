@@ -69,7 +69,7 @@ def test_pixels_count_as_far_as_their_corners():
         radius=None,
         shape=(5, 9),
         pitch=4.0,
-        gains_known=True,
+        gain_variance=0.0,
     )
     points = positions.expand(3, 2, 2) + torch.tensor([[[0.0, 0.0]], [[0.2, -0.15]], [[40.0, 0.0]]])
     found = frames_behind(samples, points, np.array([True, True, True]), Canvas.over((0, 0, 9, 5)))
