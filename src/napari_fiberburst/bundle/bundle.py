@@ -321,6 +321,7 @@ class Bundle(Stored):
             self,
             transmission=(self.transmission * per_pixel).astype(np.float32),
             gain_weights=np.minimum(total, _MOST_GAIN_WEIGHT).astype(np.float32),
+            offsets=(self.offsets / np.maximum(change, 1e-2)[:, None]).astype(np.float32),
             provenance={**self.provenance, "bursts": int(self.provenance.get("bursts", 0)) + 1},
         )
 

@@ -29,6 +29,7 @@ from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.remeasure import lit, remeasured
 from napari_fiberburst.pipeline.render import image_of
 from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.scene.offsets import find_offsets
 from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.shading import find_shading, shading_of_frames
 from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
@@ -143,6 +144,7 @@ class Stages:
             fitted = yield from self._align_by(mount.relative_to(reference))
         fitted = yield from self._refine(fitted)
         before = fitted.bundle
+        fitted = self._without_offsets(fitted)
         if self._method.flatten == "motion":
             fitted = self._flattened(fitted)
             yield fitted
@@ -294,6 +296,16 @@ class Stages:
         if self._method.flatten != "frame" or bundle.gains_known:
             return bundle
         return lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
+
+    def _without_offsets(self, fitted: Fitted) -> Fitted:
+        """Take the light that cores show by themselves into the bundle, and out of the samples."""
+        assert fitted.samples is not None
+        offsets = find_offsets(fitted.samples, fitted.registration)
+        if offsets is None:
+            return fitted
+        samples, registration = offsets.without(fitted.samples, fitted.registration)
+        bundle = offsets.added_to(fitted.bundle, fitted.registration, self._burst.acquisition)
+        return replace(fitted, samples=samples, registration=registration, bundle=bundle)
 
     def _flattened(self, fitted: Fitted) -> Fitted:
         """Take the shading that the motion tells into bundle, samples and exposures."""
