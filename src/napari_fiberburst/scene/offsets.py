@@ -15,6 +15,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import solve_quickly
@@ -78,10 +79,13 @@ def find_offsets(samples: Samples, registration: Registration) -> Offsets | None
     Returns
     -------
     Offsets or None
-        None where nothing is to be told: the object does not move, frames are few, or no core shows any.
+        None where nothing is to be told: the object does not move, frames are few or not registered well, or no core
+        shows any.
     """
     if registration.is_still or samples.kind != "cores" or int(registration.used.sum()) < _LEAST_FRAMES:
         return None
+    if not registration.unexplained <= MOST_UNEXPLAINED:  # NaN where the iterations have ended early
+        return None  # what frames in the wrong place leave looks like offsets
     found = None
     light = torch.zeros(samples.cores, samples.values.shape[2]).to(samples.values)
     gains = torch.ones(samples.cores).to(samples.values)
