@@ -53,7 +53,7 @@ def test_rotation_and_gains_are_found(positions, matrices, look, spread):
 
 
 def test_known_gains_stay_as_they_are(positions, matrices, look):
-    state = registered(problem_of(positions, look(positions, matrices()), gains_fixed=True))
+    state = registered(problem_of(positions, look(positions, matrices()), gain_variance=0.0))
     assert error(state.motion, matrices()) < 0.3
     assert torch.equal(state.gains, torch.ones(900))
 

@@ -92,6 +92,7 @@ def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
     assert {layer.name.removeprefix("run 2: ") for layer in viewer.layers if layer.name.startswith("run 2")} == {
         "image",
         "coverage",
+        "frames behind each pixel",
         "uncertainty",
         "transmission",
         "residuals",

@@ -22,6 +22,7 @@ def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated
         "burst",
         "run 1: stabilised burst",
         "run 1: coverage",
+        "run 1: frames behind each pixel",
         "run 1: uncertainty",
         "run 1: transmission",
         "run 1: residuals",

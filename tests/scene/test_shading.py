@@ -35,7 +35,7 @@ def moving(step, seed=0):
     return found
 
 
-def seen(log_shading, motion, *, noise=0.005, exposures=None, gains_known=False):
+def seen(log_shading, motion, *, noise=0.005, exposures=None, gain_variance=0.04):
     """Return samples of a smooth object under a shading (N, C), and the registration that is known of them."""
     rng = np.random.default_rng(1)
     waves = rng.normal(0, 2 * np.pi / 25, (20, 2))
@@ -55,7 +55,7 @@ def seen(log_shading, motion, *, noise=0.005, exposures=None, gains_known=False)
         radius=0.36 * PITCH,
         shape=SHAPE,
         pitch=PITCH,
-        gains_known=gains_known,
+        gain_variance=gain_variance,
     )
     return samples, Registration.known(motion, SHAPE, len(CORES))
 
@@ -107,8 +107,8 @@ def test_nothing_is_found_in_too_little_light():
     assert find_shading(*seen(0.3 * VIGNETTE, moving(6.0), noise=0.5)) is None
 
 
-def test_nothing_is_looked_for_where_the_gains_are_known():
-    assert find_shading(*seen(VIGNETTE, moving(6.0), gains_known=True)) is None
+def test_nothing_is_looked_for_where_there_is_no_bundle():
+    assert find_shading(*seen(VIGNETTE, moving(6.0), gain_variance=0.0)) is None
 
 
 def test_mean_frame_of_an_even_object_shows_the_shading():

@@ -37,6 +37,7 @@ def clean():
         {"deformation": 2.0},
         {"smear": 0.5},
         {"background": 0.3},
+        {"offset": 0.2},
         {"vignette": 2.0},
         {"field": 0.8},
         {"overlay": True},
@@ -129,6 +130,18 @@ def test_the_background_is_its_part_of_the_mean_light_and_the_same_in_all_frames
     x, y = np.rint(dark.bundle.centres[inside]).astype(int).T
     of_core = faulty.background[y, x, 0] / dark.transmission[y, x]
     assert of_core.std() / of_core.mean() == pytest.approx(0.3, abs=0.05)
+
+
+@pytest.mark.parametrize("physics", ["mask", "core"])
+def test_offsets_have_their_size_and_are_the_same_in_all_frames(physics):
+    settings = {"physics": physics, "channels": 3, "scene": even(0.4, 3)}
+    faulty, dark = burst_with(offset=0.3, **settings), burst_with(**settings)
+    added = faulty.burst.frames - dark.burst.frames
+    np.testing.assert_allclose(added, np.broadcast_to(faulty.background, added.shape), atol=3 * STEP)
+    inside = ((dark.bundle.centres > 5) & (dark.bundle.centres < [111, 85])).all(axis=1)
+    x, y = np.rint(dark.bundle.centres[inside]).astype(int).T
+    of_core = faulty.background[y, x, 0] / dark.transmission[y, x]
+    assert np.sqrt((of_core**2).mean()) == pytest.approx(0.3 * 0.4, rel=0.15)
 
 
 def test_a_vignette_darkens_the_rim_so_many_times():

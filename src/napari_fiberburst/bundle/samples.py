@@ -12,7 +12,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor
 
-from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.bundle import GUESSED_GAINS, Bundle
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.stored import Stored
@@ -59,8 +59,9 @@ class Samples(Stored):
         Height and width of a frame, pixels.
     pitch : float
         Distance of neighbouring cores, pixels.
-    gains_known : bool
-        Whether the gains of the cores are known, so that none are to be found from the burst.
+    gain_variance : float
+        Of the cores' gains about those that are taken out, as far as it is known before the burst is asked; 0 where
+        there are none to be found.
     """
 
     _kind: ClassVar[str] = "set of samples"
@@ -74,12 +75,17 @@ class Samples(Stored):
     radius: float | None
     shape: tuple[int, int]
     pitch: float
-    gains_known: bool
+    gain_variance: float
 
     @property
     def grey(self) -> Tensor:
         """Values averaged over the channels, (T, N)."""
         return self.values.mean(dim=2)
+
+    @property
+    def gains_known(self) -> bool:
+        """Whether the gains were measured beforehand, or there are none."""
+        return self.gain_variance < GUESSED_GAINS
 
     @property
     def contrast(self) -> Tensor:
@@ -228,7 +234,7 @@ def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Sa
         radius=bundle.radius,
         shape=bundle.shape,
         pitch=bundle.pitch,
-        gains_known=bundle.gains_known,
+        gain_variance=bundle.gain_variance,
     )
 
 
@@ -252,7 +258,7 @@ def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> S
         radius=None,
         shape=bundle.shape,
         pitch=bundle.pitch,
-        gains_known=bundle.gains_known,
+        gain_variance=bundle.gain_variance,
     )
 
 

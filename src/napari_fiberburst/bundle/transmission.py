@@ -14,6 +14,8 @@ from napari_fiberburst.data.burst import Acquisition
 
 # Part of the mean squared light below which a pixel has seen too little to tell its transmission.
 _LEAST_LIGHT = 1e-3
+# Gains are taken as at least this where offsets are divided by them.
+_LEAST_GAIN = 0.02
 
 Prediction = Callable[[int, Tensor], Tensor]
 
@@ -51,4 +53,6 @@ def with_gains(bundle: Bundle, per_core: Tensor, per_channel: Tensor | None = No
     """Return the bundle with gains (N,) of its cores taken into its transmission, and (N, C) into its channels."""
     factor = np.append(per_core.cpu().numpy(), np.float32(1)).astype(np.float32)[bundle.labels]
     gains = bundle.gains if per_channel is None else (bundle.gains * per_channel.cpu().numpy()).astype(np.float32)
-    return replace(bundle, transmission=bundle.transmission * factor, gains=gains)
+    # What a core shows by itself stays as it is in the frames, and is told as an amplitude of the profile.
+    offsets = (bundle.offsets / np.maximum(per_core.cpu().numpy(), _LEAST_GAIN)[:, None]).astype(np.float32)
+    return replace(bundle, transmission=bundle.transmission * factor, gains=gains, offsets=offsets)

@@ -29,7 +29,8 @@ from napari_fiberburst.operators.grid import Sampling
 
 # Relative standard deviation of exposures below which they are taken as one.
 _LEAST_FLICKER = 3e-4
-# Relative change of the gains from the middle of the field to its edge that the most even bundle may have.
+# Relative change of the gains from the middle of the field to its edge that the most even bundle may have, where they
+# are not known better.
 _UNEVENNESS = 0.02
 # Alternations of scene and exposures before the first iteration.
 _EXPOSURE_ROUNDS = 8
@@ -114,7 +115,7 @@ def iterate(problem: JointProblem, state: JointState, level: Level, number: int)
         exposures=state.exposures * log_exposures.clamp(-1, 1).exp(),
         residual=float(system.variance**0.5),
     )
-    if not problem.gains_fixed:
+    if problem.gain_variance > 0:
         moved = _level(problem, _with_best_gains(problem, moved, system.gain_prior))
     return moved, farthest
 
@@ -165,6 +166,7 @@ def _level(problem: JointProblem, state: JointState) -> JointState:
         state.gains[measured].log().cpu().double(),
         (centres - middle)[used].cpu().double(),
         state.exposures[used].log().cpu().double(),
+        min(_UNEVENNESS, problem.gain_variance**0.5),
     ).to(places)
     return replace(
         state,
@@ -174,14 +176,17 @@ def _level(problem: JointProblem, state: JointState) -> JointState:
     )
 
 
-def _slope(places: Tensor, log_gains: Tensor, shifts: Tensor, log_exposures: Tensor) -> Tensor:
-    """Return the slope (2,) that is to be moved out of the gains (G,), at places (G, 2), and exposures (T,)."""
+def _slope(places: Tensor, log_gains: Tensor, shifts: Tensor, log_exposures: Tensor, unevenness: float) -> Tensor:
+    """Return the slope (2,) that is to be moved out of the gains (G,), at places (G, 2), and exposures (T,).
+
+    The gains may change by about `unevenness` from the middle of the field to its edge.
+    """
     log_gains, log_exposures, shifts = (part - part.mean(dim=0) for part in (log_gains, log_exposures, shifts))
     information = places.T @ places + 1e-9 * torch.eye(2).double()
     by_gains = torch.linalg.solve(information, places.T @ log_gains)
     covariance = torch.linalg.inv(information) * (log_gains - places @ by_gains).square().mean()
     half = places.abs().amax().clamp_min(1.0)
-    information = torch.linalg.inv(covariance + (_UNEVENNESS / half) ** 2 * torch.eye(2).double())
+    information = torch.linalg.inv(covariance + (unevenness / half) ** 2 * torch.eye(2).double())
     left = log_exposures - shifts @ by_gains
     by_chance = (shifts @ torch.linalg.inv(information) * shifts).sum()
     variance = ((left.square().sum() - by_chance) / max(1, len(left) - 1)).clamp_min(_LEAST_FLICKER**2)

@@ -14,8 +14,8 @@ from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE
 
 # In medians of the residuals: larger ones count less (Huber, 1964).
 _HUBER = 2.5
-# Variance of the gains about 1 that is expected a priori: bundles measured have 15 to 20 % (1 sigma).
-_GAIN_VARIANCE = 0.04
+# Gains that are held so are as good as fixed.
+_LEAST_GAIN_VARIANCE = 1e-12
 # Relative variance by which an iteration may change an exposure: lamps and contact change by some tens of per cent, and
 # the exposures are known to some per cent before the first.
 _EXPOSURE_VARIANCE = 0.01
@@ -164,9 +164,9 @@ class Linearised:
             variance=variance,
             gain_change=state.gains - 1,
             # With noise of this variance, and gains of theirs about 1, the gains' prior weighs as much as this.
-            gain_prior=max(variance / _GAIN_VARIANCE, 1e-9),
+            gain_prior=max(variance / max(problem.gain_variance, _LEAST_GAIN_VARIANCE), 1e-9),
             exposure_prior=max(variance / _EXPOSURE_VARIANCE, 1e-9),
-            gains_fixed=problem.gains_fixed,
+            gains_fixed=problem.gain_variance == 0,
             smoothness=level.smoothness,
             iterations=_BENDING_ITERATIONS if level.bends else _ITERATIONS,
         )

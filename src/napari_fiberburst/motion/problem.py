@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
+from napari_fiberburst.bundle.bundle import GUESSED_GAINS
 from napari_fiberburst.motion.displacement import ControlWeights
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators.footprint import Footprint
@@ -90,8 +91,8 @@ class JointProblem:
         Unit of the levels' lengths, pixels.
     dof : int
         Degrees of freedom of each frame's motion.
-    gains_fixed : bool
-        Whether the gains stay as they are because the transmission is known.
+    gain_variance : float
+        Of the gains about 1, as far as it is known beforehand; 0 where they stay as they are.
     controls : ControlWeights or None
         From the control points of displacements to the samples; None where frames do not bend.
     """
@@ -103,7 +104,7 @@ class JointProblem:
     cores: int
     pitch: float
     dof: int
-    gains_fixed: bool = False
+    gain_variance: float = GUESSED_GAINS
     controls: ControlWeights | None = None
 
     def without(self, frames: Tensor) -> "JointProblem":

@@ -11,6 +11,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.coarse import find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.motion.freedom import restrict
+from napari_fiberburst.motion.gain_prior import with_told_prior
 from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.motion.problem import (
@@ -190,6 +191,8 @@ class _Search:
             level = replace(level, bends=found.displacement is not None)
             if self._is_spent(found):
                 break
+            if found.scene is not None and self.samples.gains_known and problem.gain_variance > 0:
+                problem = with_told_prior(problem, state)
             state = enter(problem, state, level, radius)
             for number in range(level.iterations):
                 before = state.motion
@@ -265,7 +268,7 @@ class _Search:
             cores=samples.cores,
             pitch=samples.pitch,
             dof=found.dof,
-            gains_fixed=samples.gains_known,
+            gain_variance=samples.gain_variance,
             controls=None if found.displacement is None else found.displacement.grid.at(samples.positions[chosen]),
         )
 

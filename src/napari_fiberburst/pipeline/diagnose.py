@@ -17,6 +17,7 @@ from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.pipeline.context import frames_behind
 from napari_fiberburst.pipeline.verdict import collect, judge
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
@@ -74,6 +75,7 @@ def diagnose(
     ratios, weights = _held_to_others(ratios, weights, scene, points, registration)
     found = Diagnostics(
         coverage=_coverage(samples, points, registration, scene.grid, canvas),
+        context=frames_behind(samples, points, registration.used, canvas),
         bundle=_as_seen(bundle, registration, scene, weights),
         gain_ratios=ratios.cpu().numpy().astype(np.float32),
         gain_weights=weights.cpu().numpy().astype(np.float32),

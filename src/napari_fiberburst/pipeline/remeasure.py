@@ -70,7 +70,7 @@ def flatten(
     burst : Burst
         The frames.
     bundle : Bundle
-        By `remeasure`. One whose gains are known already is returned as it is.
+        By `remeasure`.
     registration : Registration
         By `refine`.
     device : str

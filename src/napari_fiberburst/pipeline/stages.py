@@ -29,6 +29,7 @@ from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.remeasure import lit, remeasured
 from napari_fiberburst.pipeline.render import image_of
 from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.scene.offsets import find_offsets
 from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.shading import find_shading, shading_of_frames
 from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
@@ -42,6 +43,10 @@ _PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
 _SHORT_TRAVEL = 0.7
 # A union of frames reaches at most so many frames' sizes from the reference frame.
 _MOST_FIELDS = 5
+# Corrections of given gains (root mean square) that are worth a note, and that no bundle needs that was measured well.
+_LARGE_CORRECTION, _ANOTHER_BUNDLE = 0.03, 0.12
+# Part of a normal distribution that lies within one standard deviation.
+_WITHIN_ONE_SIGMA = 0.683
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -138,10 +143,12 @@ class Stages:
             # The image is in the pixels of the reference frame, so that is where the bundle has to rest.
             fitted = yield from self._align_by(mount.relative_to(reference))
         fitted = yield from self._refine(fitted)
+        before = fitted.bundle
+        fitted = self._without_offsets(fitted)
         if self._method.flatten == "motion":
             fitted = self._flattened(fitted)
             yield fitted
-        return fitted
+        return fitted if self._given is None else _compared(fitted, before)
 
     def _align_by(self, mount: Mount | None) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register frames in which the bundle is brought to rest."""
@@ -290,6 +297,16 @@ class Stages:
             return bundle
         return lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
 
+    def _without_offsets(self, fitted: Fitted) -> Fitted:
+        """Take the light that cores show by themselves into the bundle, and out of the samples."""
+        assert fitted.samples is not None
+        offsets = find_offsets(fitted.samples, fitted.registration)
+        if offsets is None:
+            return fitted
+        samples, registration = offsets.without(fitted.samples, fitted.registration)
+        bundle = offsets.added_to(fitted.bundle, fitted.registration, self._burst.acquisition)
+        return replace(fitted, samples=samples, registration=registration, bundle=bundle)
+
     def _flattened(self, fitted: Fitted) -> Fitted:
         """Take the shading that the motion tells into bundle, samples and exposures."""
         assert fitted.samples is not None
@@ -391,6 +408,27 @@ class Stages:
         first = canvas.reference_from_image[:2, 2]
         last = first + canvas.reference_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
         return grid_over((*first.tolist(), *last.tolist()), spacing, fitted.bundle.pitch + fitted.bundle.radius)
+
+
+def _compared(fitted: Fitted, given: Bundle) -> Fitted:
+    """Note how far the burst has corrected the gains of a bundle that was given, where that is far."""
+    assert fitted.samples is not None
+    power = torch.zeros(fitted.samples.cores).to(fitted.samples.weights)
+    power.index_add_(0, fitted.samples.core_index, fitted.samples.weights.sum(dim=0))
+    before, after = given.brightness, fitted.bundle.brightness * fitted.registration.gains
+    known = (power.cpu().numpy() > 0) & (before > 0) & (after > 0)
+    if not known.any():
+        return fitted
+    change = after[known] / before[known]
+    change = change / np.median(change) - 1
+    # Of a normal distribution the root mean square; a few cores at the rim do not decide.
+    size = float(np.quantile(np.abs(change), _WITHIN_ONE_SIGMA))
+    if size < _LARGE_CORRECTION:
+        return fitted
+    text = f"the burst has corrected the gains of the given bundle by {100 * size:.0f} % (rms)"
+    if size > _ANOTHER_BUNDLE:
+        text += ", as if it were of another bundle or in other light; calibrate it again"
+    return replace(fitted, notes=(*fitted.notes, _warned(text)))
 
 
 def _typical_noise(fitted: Fitted, acquisition: Acquisition, samples: Samples) -> float:

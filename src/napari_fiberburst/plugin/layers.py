@@ -130,6 +130,8 @@ class RunLayers:
             yield
         self._add("coverage", result.coverage, "YX", canvas, colormap="viridis")
         yield
+        self._add("frames behind each pixel", result.context, "YX", canvas, colormap="viridis")
+        yield
         self._add("uncertainty", result.uncertainty, "YX", canvas, colormap="magma")
         yield
         bundle = result.bundle

@@ -20,6 +20,9 @@ class Diagnostics:
     coverage : numpy.ndarray or None
         (H, W) float32 on the canvas: how many core samples have seen each pixel; 0 where the image is filled in
         from its surroundings.
+    context : numpy.ndarray or None
+        (H, W) int32 on the canvas: how many frames have a sample whose footprint, or pixel, covers the centre of each
+        pixel; samples that were left out do not count.
     uncertainty : numpy.ndarray or None
         (H, W) float32 on the canvas, the standard deviation to be expected of the image, intensity units, averaged
         over the channels. It holds what noise and gaps do, not what a wrong model does.
@@ -60,6 +63,7 @@ class Diagnostics:
     """
 
     coverage: NDArray[np.float32] | None = None
+    context: NDArray[np.int32] | None = None
     uncertainty: NDArray[np.float32] | None = None
     bundle: Bundle | None = None
     gain_ratios: NDArray[np.float32] | None = None

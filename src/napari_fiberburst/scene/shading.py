@@ -107,9 +107,9 @@ def find_shading(samples: Samples, registration: Registration) -> Shading | None
     Returns
     -------
     Shading or None
-        None where nothing is to be told: the object does not move, the gains are known, or the light is even.
+        None where nothing is to be told: the object does not move, there is no bundle, or the light is even.
     """
-    if registration.is_still or samples.gains_known:
+    if registration.is_still or samples.gain_variance == 0:
         return None
     found = Shading(
         gains=torch.ones(samples.cores, samples.values.shape[2]).to(samples.values),

@@ -41,6 +41,12 @@ class Faults:
     background: float = parameter(
         0.0, "Light of the bundle itself, in parts of the mean light from the object; more dulls.", least=0, most=20
     )
+    offset: float = parameter(
+        0.0,
+        "Light that each core shows by itself, root mean square in parts of the mean light; more adds dots.",
+        least=0,
+        most=5,
+    )
     vignette: float = parameter(1.0, "How many times darker the rim is than the middle; 1 is even.", least=1, most=100)
     field: float | None = parameter(
         None,
@@ -88,7 +94,9 @@ class Draws:
     bundle_offsets : numpy.ndarray
         (T, 2) float64: how far the bundle has moved on the camera, (x, y) in pixels.
     glow : numpy.ndarray
-        (N, 1) float32: how much light each core adds by itself, about 1.
+        (N, 1) float32: how much of the background's light each core adds, about 1.
+    offsets : numpy.ndarray
+        (N, 1) float32: how much light each core shows beyond that, root mean square 1.
     """
 
     exposures: NDArray[np.float64]
@@ -98,6 +106,7 @@ class Draws:
     white: NDArray[np.intp]
     bundle_offsets: NDArray[np.float64]
     glow: NDArray[np.float32]
+    offsets: NDArray[np.float32]
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -128,7 +137,7 @@ def draw(faults: Faults, frames: int, field: NDArray[np.bool_], radius: float, c
     SettingsError
         More frames are to be black or white than there are beside frame 0.
     """
-    flicker_rng, bend_rng, intruder_rng, frames_rng, shift_rng, glow_rng = rng.spawn(6)
+    flicker_rng, bend_rng, intruder_rng, frames_rng, shift_rng, glow_rng, offset_rng = rng.spawn(7)
     black, white = _draw_unusable(faults, frames, frames_rng)
     return Draws(
         exposures=_draw_exposures(faults, frames, flicker_rng),
@@ -138,6 +147,7 @@ def draw(faults: Faults, frames: int, field: NDArray[np.bool_], radius: float, c
         white=white,
         bundle_offsets=_draw_bundle_offsets(faults, frames, shift_rng),
         glow=np.maximum(glow_rng.normal(1, _BACKGROUND_SPREAD, (cores, 1)), 0).astype(np.float32),
+        offsets=np.abs(offset_rng.standard_normal((cores, 1))).astype(np.float32),
     )
 
 

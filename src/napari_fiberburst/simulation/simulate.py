@@ -70,7 +70,8 @@ class SimulatedBurst:
     intruder : numpy.ndarray or None
         (T, H, W) bool: where something else hides the object.
     background : numpy.ndarray or None
-        (H, W, C) float32: light of the bundle itself in frame 0, at an exposure of 1, in parts of full scale.
+        (H, W, C) float32: light of the bundle itself, background and offsets, in frame 0, at an exposure of 1, in parts
+        of full scale.
     shading : numpy.ndarray or None
         (H, W, C) float32 in [0, 1]: what vignette and round field leave of the light.
     visible : numpy.ndarray or None
@@ -220,7 +221,7 @@ def simulate(
     truth, seen = _look(world, size, homographies, draws, faults.smear)
     moved = relay_at(draws.bundle_offsets[-1]) if draws.bundle_offsets.any() else relay
     relays = [moved if offset.any() else relay for offset in draws.bundle_offsets]
-    light, background = _relayed(seen, relays, physics, draws, optics, faults.background)
+    light, background = _relayed(seen, relays, physics, draws, optics, faults)
     flat_field = relay.flat if optics.shading is None else relay.flat * optics.shading
     return SimulatedBurst(
         burst=_as_burst(_photographed(light, camera, camera_rng, draws, optics), camera.full_scale),
@@ -276,17 +277,25 @@ def _relayed(
     physics: str,
     draws: Draws,
     optics: Optics,
-    background: float,
+    faults: Faults,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Return the light (T, H, W, C) that reaches the camera, and what the bundle adds of its own in frame 0."""
     shading = np.float32(1) if optics.shading is None else optics.shading
     light = np.empty_like(seen)
     for shown, frame, relay in zip(light, seen, relays, strict=True):
         shown[:] = shading * (frame * relay.flat.astype(np.float32) if physics == "mask" else relay.through(frame))
-    glow = None
-    if background > 0:
-        glow = np.stack([np.broadcast_to(shading * relay.emit(draws.glow), seen.shape[1:]) for relay in relays])
-        glow *= background * light[:, optics.field].mean() / glow[0, optics.field].mean()
+    added = []
+    for size, cores, unit in (
+        (faults.background, draws.glow, draws.glow),
+        (faults.offset, draws.offsets, np.ones_like(draws.offsets)),
+    ):
+        if size > 0:
+            scale = size * light[:, optics.field].mean() / (shading * relays[0].emit(unit))[optics.field].mean()
+            added.append(
+                np.stack([np.broadcast_to(shading * relay.emit(scale * cores), seen.shape[1:]) for relay in relays])
+            )
+    glow = sum(added[1:], start=added[0]) if added else None
+    if glow is not None:
         light += glow
     light *= draws.exposures.astype(np.float32)[:, None, None, None]
     return light, None if glow is None else glow[0]
