@@ -35,7 +35,7 @@ def burst():
         radius=1.5,
         shape=SHAPE,
         pitch=4.0,
-        gains_known=False,
+        gain_variance=0.04,
     )
     return samples, points
 
