@@ -8,9 +8,7 @@ times what the scene's own noise adds. What all frames have in common is the sce
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
-from scipy.linalg import logm
 from torch import Tensor
 
 from napari_fiberburst.coordinates import half_frame_from_pixel
@@ -109,16 +107,23 @@ def _information(problem: JointProblem, state: JointState) -> Tensor:
 
 def _split(transforms: Tensor, basis: Tensor, dof: int) -> tuple[Tensor, Tensor]:
     """Split transforms (T, 3, 3) into what goes beyond a smaller model, (T, k - dof), and members of that model."""
-    coordinates = torch.linalg.pinv(basis.reshape(len(basis), 9).T)[dof:]
     beyond = torch.zeros(len(transforms), len(basis) - dof, dtype=torch.float64)
     for _ in range(_ROUNDS):
-        members = _exp(-beyond, basis[dof:]) @ transforms
-        logarithms = torch.from_numpy(np.stack([logm(member).real for member in members.numpy()]))
-        step = logarithms.reshape(-1, 9) @ coordinates.T
+        step = _coordinates(_exp(-beyond, basis[dof:]) @ transforms)[:, dof : len(basis)]
         beyond = beyond + step
         if float(step.abs().max()) < _SPLIT:
             break
     return beyond, _exp(-beyond, basis[dof:]) @ transforms
+
+
+def _coordinates(transforms: Tensor) -> Tensor:
+    """Return functions (T, 8) of transforms (T, 3, 3) that are the generators' coordinates near the identity.
+
+    Those beyond a model's degrees of freedom are 0 for its members, wherever these are.
+    """
+    rows = (transforms / transforms[:, 2:, 2:]).unbind(dim=1)
+    (a, b, x), (c, d, y), (p, q, _) = (row.unbind(dim=1) for row in rows)
+    return torch.stack([x, y, (c - b) / 2, (a + d) / 2 - 1, (a - d) / 2, (b + c) / 2, p, q], dim=1)
 
 
 def _exp(steps: Tensor, basis: Tensor) -> Tensor:
