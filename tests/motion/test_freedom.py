@@ -10,7 +10,7 @@ from napari_fiberburst.simulation import simulate
 SHAPE = (151, 173)
 
 
-def motion_like(kind: str, frames: int = 9) -> np.ndarray:
+def motion_like(kind: str, frames: int = 14) -> np.ndarray:
     """Return homographies (T, 3, 3), frame-t pixel to frame-0 pixel, about the middle of the frame."""
     rng = np.random.default_rng(4)
     middle = np.array([[1, 0, SHAPE[1] / 2], [0, 1, SHAPE[0] / 2], [0, 0, 1]])
@@ -30,7 +30,7 @@ def motion_like(kind: str, frames: int = 9) -> np.ndarray:
 @pytest.mark.parametrize("kind", ["translation", "similarity", "affine", "homography"])
 def test_a_burst_is_registered_with_the_freedom_that_its_frames_have(kind):
     simulated = simulate(
-        "histology", shape=SHAPE, frames=9, channels=1, motion=motion_like(kind), pitch=4.7, physics="core", seed=2
+        "histology", shape=SHAPE, frames=14, channels=1, motion=motion_like(kind), pitch=4.7, physics="core", seed=2
     )
     result = reconstruct(simulated.burst, device="cpu")
     assert result.settings.method.motion.name == kind
@@ -39,16 +39,16 @@ def test_a_burst_is_registered_with_the_freedom_that_its_frames_have(kind):
 
 def test_frames_of_a_smaller_model_are_members_of_it():
     simulated = simulate(
-        "cat", shape=SHAPE, frames=9, motion=motion_like("translation"), pitch=4.7, physics="core", seed=1
+        "cat", shape=SHAPE, frames=14, motion=motion_like("translation"), pitch=4.7, physics="core", seed=1
     )
     result = reconstruct(simulated.burst, device="cpu")
-    np.testing.assert_allclose(result.homographies[:, :2, :2], np.tile(np.eye(2), (9, 1, 1)), atol=1e-9)
-    np.testing.assert_allclose(result.homographies[:, 2], np.tile([0, 0, 1.0], (9, 1)), atol=1e-9)
+    np.testing.assert_allclose(result.homographies[:, :2, :2], np.tile(np.eye(2), (14, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(result.homographies[:, 2], np.tile([0, 0, 1.0], (14, 1)), atol=1e-9)
 
 
 def test_less_freedom_costs_no_quality():
     simulated = simulate(
-        "histology", shape=SHAPE, frames=9, motion=motion_like("translation"), pitch=4.7, physics="core", seed=7
+        "histology", shape=SHAPE, frames=14, motion=motion_like("translation"), pitch=4.7, physics="core", seed=7
     )
     free, chosen = (reconstruct(simulated.burst, motion=motion, device="cpu") for motion in ("homography", "auto"))
     assert chosen.settings.method.motion.name == "translation"

@@ -19,10 +19,10 @@ from napari_fiberburst.operators.jacobian import GeneratorSlopes
 
 # Degrees of freedom of the models that are tried, from the smallest.
 _MODELS = (2, 4, 6)
-# The smaller model is enough where r' S r is at most so many times the number of parameters. Simulated bursts of five
-# scenes have 4 to 54 where it is true, because the frames share a scene that is not known better than they are; and 62
-# and more where it is not. Between these, what a wrong choice costs is within the errors of both.
-_ENOUGH = 30.0
+# The smaller model is enough where r' S r is at most so many times the number of parameters. Where it is true, bursts
+# of 12 frames and more have 3 to 16, because the frames share a scene that is not known better than they are, and
+# smaller ones more. Where it is not, the faintest have 19.
+_ENOUGH = 12.0
 # Fewer frames do not tell.
 _FEWEST_FRAMES = 3
 # Splitting a transform goes on until r changes by no more than this, in half frames.

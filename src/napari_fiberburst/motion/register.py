@@ -28,6 +28,7 @@ from napari_fiberburst.motion.problem import (
 from napari_fiberburst.motion.registration import GreyScene, Registration, unregistered
 from napari_fiberburst.motion.score import bending_score
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED, alone, judged, still, unexplained_part
+from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.steps import drain
 
 # The motion has a handful of unknowns a frame, so this many samples of it are plenty,
@@ -83,7 +84,12 @@ def register(
 
 
 def refine(
-    samples: Samples, registration: Registration, *, iterations: int | None = None, seed: int = 0
+    samples: Samples,
+    registration: Registration,
+    *,
+    dof: int | None = None,
+    iterations: int | None = None,
+    seed: int = 0,
 ) -> Registration:
     """Refine a registration to some hundredths of a pixel, with the footprint of the samples in the model.
 
@@ -93,7 +99,7 @@ def refine(
         Of cores or of pixels, by a bundle that was measured again after the frames were registered.
     registration : Registration
         By `register`. One whose object does not move is returned as it is.
-    seed
+    dof, seed
         As for `register`.
     iterations : int, optional
         Gauss-Newton iterations at most, those of `registration` included.
@@ -103,7 +109,7 @@ def refine(
     Registration
         With the gains relative to what the samples assume.
     """
-    return drain(refining(samples, registration, iterations=iterations, seed=seed))
+    return drain(refining(samples, registration, dof=dof, iterations=iterations, seed=seed))
 
 
 def registering(
@@ -138,8 +144,6 @@ def registering(
     if bends or (bends is None and search.asks_to_bend(found)):
         bent = yield from search.refine(_bendable(found, samples), BENDING, None, None)
         found = bent if bends or bent.residual < _MOST_LEFT_BY_BENDING * found.residual else found
-    if dof is None and found.displacement is None:
-        found = search.restricted(found)
     found = judged(replace(found, unexplained=unexplained_part(found, samples, noise)), samples)
     if found.used.sum() < 2:
         return alone(found, samples)
@@ -147,7 +151,7 @@ def registering(
 
 
 def refining(
-    samples: Samples, found: Registration, *, iterations: int | None, seed: int
+    samples: Samples, found: Registration, *, dof: int | None, iterations: int | None, seed: int
 ) -> Generator[Registration, None, Registration]:
     """Refine a registration, and find the gains, by the final samples of the bundle; yields after each iteration.
 
@@ -157,7 +161,7 @@ def refining(
         Of cores, with their footprint, or of pixels.
     found : Registration
         By `register`; its frames lie on the same scene.
-    seed
+    dof, seed
         As for `register`.
     iterations : int, optional
         Gauss-Newton iterations at most, those that `found` has had included.
@@ -167,7 +171,8 @@ def refining(
     shifts = found.scene_from_frame[:, :2, 2].copy()
     search = _Search(samples=samples, shifts=shifts, noise=0.0, iterations=iterations, seed=seed)
     levels, most = (FINE_PIXELS, _MOST_SAMPLES) if samples.kind == "pixels" else (FINE_CORES, None)
-    return (yield from search.refine(found, levels, samples.radius, most))
+    found = yield from search.refine(found, levels, samples.radius, most)
+    return search.restricted(found, most) if dof is None and found.displacement is None else found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -233,12 +238,14 @@ class _Search:
         score = bending_score(problem, self._resumed(found, found.scene, problem))
         return score > (_SCORE if unexplained > _UNEXPLAINED_BY_PLANES else _CLEAR_SCORE)
 
-    def restricted(self, found: Registration) -> Registration:
-        """Return the registration within the smallest model of motion that explains it."""
+    def restricted(self, found: Registration, most: int | None) -> Registration:
+        """Return a registration by the samples' footprint within the smallest model of motion that explains it."""
         if found.scene is None or self._is_spent(found):
             return found
-        problem = self._problem(found, found.scene.light, None)
+        problem = self._problem(found, found.scene.light, most)
         state = self._resumed(found, found.scene, problem)
+        if self.samples.radius is not None:
+            state = replace(state, footprint=Footprint(state.grid, self.samples.radius, state.scene.device))
         restriction = restrict(problem, state)
         if restriction is None:
             return found

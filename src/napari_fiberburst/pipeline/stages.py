@@ -336,6 +336,7 @@ class Stages:
         steps = refining(
             samples,
             registration,
+            dof=self._method.motion.dof,
             iterations=self._method.iterations,
             seed=self._seed,
         )
