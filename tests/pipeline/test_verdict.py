@@ -112,13 +112,13 @@ def test_each_sign_of_a_fault_is_a_reason_of_its_own():
     spoilt[:9] = 30.0
     uneven = (1.0,) * 8 + (3.0,) * 8
     signs = [
-        {"error": 0.3},
+        {"error": 0.3, "disagreement": 0.2},
         {"disagreement": 0.4},
         {"still": 5.0},
-        {"structure": 0.4, "error": 0.15},
+        {"structure": 0.4, "error": 0.15, "disagreement": 0.2},
         {"structure": -0.1},
-        {"frame_misfit": uneven, "error": 0.15},
-        {"core_misfit": spoilt, "error": 0.15},
+        {"frame_misfit": uneven, "error": 0.15, "disagreement": 0.2},
+        {"core_misfit": spoilt, "error": 0.15, "disagreement": 0.2},
     ]
     reasons = [verdict(**sign).reasons for sign in signs]
     assert all(len(found) == 1 for found in reasons)
@@ -126,9 +126,14 @@ def test_each_sign_of_a_fault_is_a_reason_of_its_own():
 
 
 def test_few_frames_may_miss_more_of_what_is_left_out():
-    assert verdict(frames=6, error=0.3).quality == "good"
-    assert verdict(frames=16, error=0.3).quality == "doubtful"
-    assert verdict(frames=16, error=0.8).quality == "bad"
+    apart = {"disagreement": 0.2}
+    assert verdict(frames=6, error=0.3, **apart).quality == "good"
+    assert verdict(frames=16, error=0.3, **apart).quality == "doubtful"
+    assert verdict(frames=16, error=0.8, **apart).quality == "bad"
+
+
+def test_single_cores_that_are_missed_do_not_spoil_an_image_whose_halves_agree():
+    assert verdict(error=0.3, disagreement=0.08).quality == "good"
 
 
 def test_misfits_are_known_per_frame_and_per_core(monkeypatch):

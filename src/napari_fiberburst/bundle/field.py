@@ -41,6 +41,9 @@ _BAY = 0.025
 # The light fades out over a rim of so many pixels, or of this part of the shorter side if that is more.
 _RIM, _RIM_OF_SIDE = 6, 0.018
 
+# Pixels within this of a hull's edge lie on it.
+_ON_EDGE = 1e-6
+
 
 def find_field(frames: Tensor, pitch: float | None = None) -> Tensor:
     """Return where frames of a moving object show it, (H, W) bool: everywhere, if no surroundings are dark.
@@ -150,10 +153,18 @@ def _convex_hull(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the pixels whose centres lie in the convex hull of those of the marked ones, which are no single line."""
     y, x = np.nonzero(marked ^ ndimage.binary_erosion(marked))
     facets = ConvexHull(np.stack([y, x], axis=1)).equations
-    rows, columns = np.ogrid[: marked.shape[0], : marked.shape[1]]
-    inside = np.ones(marked.shape, dtype=bool)
+    rows, columns = np.arange(marked.shape[0]), np.arange(marked.shape[1])
+    # Each facet bounds the columns of every row on one side.
+    first, last = np.zeros(len(rows)), np.full(len(rows), len(columns) - 1.0)
     for slope_y, slope_x, offset in facets:
-        inside &= slope_y * rows + slope_x * columns + offset <= 1e-6
+        least = slope_y * rows + offset - _ON_EDGE
+        if abs(slope_x) < _ON_EDGE:
+            last[least > 0] = -1
+        elif slope_x > 0:
+            last = np.minimum(last, -least / slope_x)
+        else:
+            first = np.maximum(first, -least / slope_x)
+    inside: NDArray[np.bool_] = (columns >= first[:, None]) & (columns <= last[:, None])
     return inside
 
 
