@@ -133,7 +133,11 @@ def test_few_frames_may_miss_more_of_what_is_left_out():
 
 
 def test_single_cores_that_are_missed_do_not_spoil_an_image_whose_halves_agree():
-    assert verdict(error=0.3, disagreement=0.08).quality == "good"
+    single = np.full(300, 2.0, np.float32)
+    single[:9] = 20.0
+    assert verdict(error=0.3, disagreement=0.08, core_misfit=single).quality == "good"
+    assert verdict(error=0.3, disagreement=0.2, core_misfit=single).quality == "doubtful"
+    assert verdict(error=0.3, disagreement=0.08).quality == "doubtful"
 
 
 def test_misfits_are_known_per_frame_and_per_core(monkeypatch):

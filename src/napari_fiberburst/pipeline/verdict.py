@@ -27,20 +27,22 @@ _DOUBTFUL_ERROR, _BAD_ERROR, _ENOUGH_FRAMES = 0.18, 0.4, 14
 # What noise is left in errors of pixels is told from those alone.
 _DOUBTFUL_PIXELS = 0.3
 # Disagreement of the first half of the frames with the second, in the same parts. Up to the second number the halves
-# agree, and samples are missed because single cores are, whose gains are off or that lie at an edge.
+# agree.
 _DISAGREEMENT, _AGREEMENT = 0.25, 0.12
 # Residuals of at most this many standard deviations of the noise are noise, however little of the object is seen.
-_NOISE_ALONE = 1.07
+_NOISE_ALONE = 1.15
 # Cores' gains are not known better than to this part, so errors of this part of the light are to be expected.
 _GAIN_ERROR = 0.01
 # Below this part of the error that is allowed, signs of single faults do not matter.
 _SMALL_ERROR = 0.5
 # Ratio of the residuals of blurred frames to those of sharp ones, upper to lower quartile, less 1; it grows as frames
 # get fewer, as above.
-_UNEVEN_FRAMES = 0.8
+_UNEVEN_FRAMES = 0.7
 # Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
 # edges stand out in it, so it grows with the square of the above.
 _UNEVEN_CORES, _WORST = 9.0, 0.99
+# From this ratio on single cores make most of the error: their gains are off, or they lie at an edge.
+_SINGLE_CORES = 6.0
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
@@ -218,9 +220,9 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     # NaN, a misfit that is not known, is no reason to take it for noise.
     is_more_than_noise = not registration.is_still and not fit.misfit <= _NOISE_ALONE
     allowed = _DOUBTFUL_ERROR * gaps if fit.is_noise_known else _DOUBTFUL_PIXELS
-    is_confirmed = not fit.disagreement <= _AGREEMENT * gaps
-    is_material = is_confirmed and fit.error > _SMALL_ERROR * allowed
-    if is_more_than_noise and is_confirmed and fit.error > allowed:
+    is_of_single_cores = fit.disagreement <= _AGREEMENT * gaps and fit.peak > _SINGLE_CORES
+    is_material = not is_of_single_cores and fit.error > _SMALL_ERROR * allowed
+    if is_more_than_noise and not is_of_single_cores and fit.error > allowed:
         is_bad = fit.error > allowed * _BAD_ERROR / _DOUBTFUL_ERROR
         reasons.append(
             f"samples that were left out are missed by {100 * fit.error:.0f} % of what changes in them: the object "
