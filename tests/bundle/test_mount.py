@@ -98,3 +98,9 @@ def test_samples_beyond_the_recorded_frame_count_for_nothing():
     torch.testing.assert_close(seen.weights[0], samples.weights[0])
     torch.testing.assert_close(seen.weights[1], samples.weights[1] * (x + 3 < SHAPE[1] - 1 - margin))
     torch.testing.assert_close(seen.weights[2], samples.weights[2] * (y - 2 > margin))
+
+
+def test_frames_that_moved_by_whole_pixels_are_as_recorded():
+    offsets = np.array([[0, 0], [0.02, -0.01], [1, 2.01], [0.5, 0], [-1, 0], [0, 0.3]])
+    assert Mount(offsets).exact.tolist() == [True, True, True, False, True, False]
+    assert Mount(offsets[2:]).exact.all()

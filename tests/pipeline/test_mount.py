@@ -85,3 +85,10 @@ def test_where_frame_0_is_bad_the_bundle_rests_where_the_reference_has_it(shifte
 def test_networks_learn_the_motion_of_the_frames_as_recorded(shifted):
     result = reconstruct(shifted.burst, encoding="hash", iterations=60, device="cpu")
     assert motion_error(result.homographies, shifted.homographies, SHAPE) < 0.2
+
+
+def test_what_interpolation_does_is_not_taken_for_the_noise_of_the_camera():
+    quiet = {"shape": SHAPE, "frames": 12, "pitch": 4.0, "physics": "core", "seed": 3}
+    rests = reconstruct(simulate("histology", **quiet).burst)
+    moves = reconstruct(simulate("histology", faults=Faults(bundle_shift=0.5), **quiet).burst)
+    assert moves.misfit > 0.8 * rests.misfit

@@ -47,6 +47,8 @@ _LEAST_GAIN, _LEAST_GAIN_OF_FRAMES = 1.02, 0.3
 _LEAST_RING = 4.0
 # A frame that agrees with the others less than this part of the median frame does not show the bundle.
 _LEAST_OF_USUAL = 0.3
+# Pixels: a part of a pixel below which interpolation changes nothing; and frames without more that are enough.
+_LEAST_PART, _FEWEST_FRAMES = 0.05, 4
 # Frames are interpolated by a spline of this order.
 _SPLINE_ORDER: Final = 3
 
@@ -74,6 +76,13 @@ class Mount:
         # On the side from which the bundle has come, nothing is missing.
         is_seen = ((places > first) | (offsets >= 0)) & ((places < last) | (offsets <= 0))
         return replace(samples, weights=samples.weights * is_seen.all(dim=2))
+
+    @property
+    def exact(self) -> NDArray[np.bool_]:
+        """(T,), frames that are as good as not interpolated; all where these are too few to measure anything by."""
+        parts = np.abs(self.offsets - self.offsets.round()).max(axis=1)
+        near: NDArray[np.bool_] = parts < _LEAST_PART
+        return near if near.sum() >= _FEWEST_FRAMES else np.ones_like(near)
 
     def relative_to(self, frame: int) -> "Mount":
         """Return the same, from where the bundle is in another frame."""

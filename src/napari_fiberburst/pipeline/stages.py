@@ -166,11 +166,19 @@ class Stages:
             canvas=self._frame_canvas(),
             mount=mount,
             notes=(*steadied, *notes),
-            noise=measure_noise(self._grey, bundle, self._burst, samples),
+            noise=self._noise(bundle, samples, mount),
         )
         yield fitted
         fitted = yield from self._register(fitted, samples)
         return (yield from self._from_equal_gains(fitted)) if self._is_start_in_doubt(fitted) else fitted
+
+    def _noise(self, bundle: Bundle, samples: Samples, mount: Mount | None) -> Noise | None:
+        """Measure the camera's noise in frames that are as they were recorded."""
+        if mount is None:
+            return measure_noise(self._grey, bundle, self._burst, samples)
+        exact = torch.from_numpy(mount.exact).to(self._grey.device)
+        recorded = replace(samples, values=samples.values[exact], weights=samples.weights[exact])
+        return measure_noise(self._grey[exact], bundle, self._burst, recorded)
 
     def solve(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Solve the scene for the bundle and motion as they are."""
