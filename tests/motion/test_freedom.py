@@ -53,3 +53,10 @@ def test_less_freedom_costs_no_quality():
     free, chosen = (reconstruct(simulated.burst, motion=motion, device="cpu") for motion in ("homography", "auto"))
     assert chosen.settings.method.motion.name == "translation"
     assert psnr(chosen.image, simulated.truth[0]) > psnr(free.image, simulated.truth[0]) - 0.05
+
+
+def test_a_coarse_bundle_does_not_bend_the_frames_of_a_rigid_object():
+    simulated = simulate("tissue", shape=(224, 224), frames=20, pitch=12.0, physics="core", seed=0)
+    result = reconstruct(simulated.burst, device="cpu")
+    assert not result.bends
+    assert motion_error(result.homographies, simulated.homographies, (224, 224)) < 0.5
