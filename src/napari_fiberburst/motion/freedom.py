@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.coordinates import half_frame_from_pixel
-from napari_fiberburst.motion.linearised import huber, linearise
+from napari_fiberburst.motion.linearised import linearise, residuals
 from napari_fiberburst.motion.models import FrameMotion, generators
 from napari_fiberburst.motion.problem import FINER, JointProblem, JointState
 from napari_fiberburst.operators.jacobian import GeneratorSlopes
@@ -96,10 +96,7 @@ def _information(problem: JointProblem, state: JointState) -> Tensor:
     """Return the information on each frame's generators, (T, k, k) float64, by the variance of the residuals."""
     jacobian = linearise(problem, state, FINER[-1])
     assert isinstance(jacobian.motion, GeneratorSlopes)
-    residual = problem.values - jacobian.gains * jacobian.light
-    weights = problem.weights * jacobian.sampling.inside
-    weights = weights * huber(residual, weights)
-    variance = float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
+    _, weights, variance = residuals(problem, jacobian)
     slopes = jacobian.motion.slopes
     blocks = (slopes * weights[:, None]) @ slopes.mT
     return blocks.cpu().double() / max(variance, 1e-12)

@@ -152,10 +152,7 @@ class Linearised:
     def of(cls, problem: JointProblem, state: JointState, level: Level, damping: float) -> "Linearised":
         """Linearise at a state."""
         jacobian = linearise(problem, state, level)
-        residual = problem.values - jacobian.gains * jacobian.light
-        weights = problem.weights * jacobian.sampling.inside
-        weights = weights * huber(residual, weights)
-        variance = float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
+        residual, weights, variance = residuals(problem, jacobian)
         return cls(
             jacobian=jacobian,
             motion=_motion_term(problem, state, jacobian, weights, damping, variance),
@@ -247,6 +244,14 @@ def _motion_term(
         )
     assert isinstance(jacobian.motion, GeneratorSlopes)
     return RigidTerm.of(jacobian.motion, weights, damping)
+
+
+def residuals(problem: JointProblem, jacobian: JointJacobian) -> tuple[Tensor, Tensor, float]:
+    """Return what the model leaves (T, N), how much it counts, large residuals less, and its variance."""
+    residual = problem.values - jacobian.gains * jacobian.light
+    weights = problem.weights * jacobian.sampling.inside
+    weights = weights * huber(residual, weights)
+    return residual, weights, float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
 
 
 def huber(residual: Tensor, weights: Tensor) -> Tensor:

@@ -143,7 +143,7 @@ def registering(
     found = yield from search.refine(found, FINER, None, None)
     if bends or (bends is None and search.asks_to_bend(found)):
         bent = yield from search.refine(_bendable(found, samples), BENDING, None, None)
-        found = bent if bends or _honest(bent, samples) < _MOST_LEFT_BY_BENDING * found.residual else found
+        found = bent if bends or _unbiased_residual(bent, samples) < _MOST_LEFT_BY_BENDING * found.residual else found
     found = judged(replace(found, unexplained=unexplained_part(found, samples, noise)), samples)
     if found.used.sum() < 2:
         return alone(found, samples)
@@ -299,7 +299,7 @@ def _bendable(found: Registration, samples: Samples) -> Registration:
     return replace(found, displacement=Displacement.none(len(found.used), grid, samples.positions.device))
 
 
-def _honest(bent: Registration, samples: Samples) -> float:
+def _unbiased_residual(bent: Registration, samples: Samples) -> float:
     """Return what frames that bend leave, as it would be if their control points had not followed the noise."""
     assert bent.displacement is not None
     taken = int((samples.weighted(torch.from_numpy(bent.used)).weights > 0).sum())

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
-from napari_fiberburst.motion.linearised import huber, linearise
+from napari_fiberburst.motion.linearised import linearise, residuals
 from napari_fiberburst.motion.problem import FINER, JointProblem, JointState
 from napari_fiberburst.operators.jacobian import ControlSlopes
 
@@ -35,10 +35,7 @@ def bending_score(problem: JointProblem, state: JointState) -> float:
     slopes = jacobian.motion
     assert isinstance(slopes, ControlSlopes)
     assert problem.controls is not None
-    residual = problem.values - jacobian.gains * jacobian.light
-    weights = problem.weights * jacobian.sampling.inside
-    weights = weights * huber(residual, weights)
-    variance = (weights * residual**2).sum() / weights.sum().clamp_min(1e-12)
+    residual, weights, variance = residuals(problem, jacobian)
     score = slopes.adjoint(weights * residual)
     x, y = (problem.controls.normal_diagonal((weights * slope) ** 2) for slope in (slopes.along_x, slopes.along_y))
     information = score.new_empty(score.shape)

@@ -1,5 +1,7 @@
 """Whether two halves of a burst, solved apart at the same motion, show the same scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -8,8 +10,8 @@ from torch import Tensor
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
-from napari_fiberburst.scene.smoothness import UNTOLD
-from napari_fiberburst.scene.spline import NormalEquations
+from napari_fiberburst.scene.smoothness import UNTOLD, among_frames
+from napari_fiberburst.scene.spline import assemble
 
 # Between nodes, in pitches, and where samples are pixels at most in those: a comparison needs no finer detail.
 _SPACING, _SPACING_OF_PIXELS = 0.5, 2.0
@@ -45,12 +47,10 @@ def disagreement(samples: Samples, points: Tensor, frames: NDArray[np.intp]) -> 
     if samples.kind == "pixels":
         spacing = min(spacing, _SPACING_OF_PIXELS)
     grid = Grid.around(points[frames], spacing, 2 * samples.pitch)
-    grey = samples.grey[..., None]
+    in_grey = replace(samples, values=samples.grey[..., None])
     shown, densities = [], []
     for half in (frames[: len(frames) // 2], frames[len(frames) // 2 :]):
-        normal = NormalEquations.empty(grid, samples.radius, 1, points.device)
-        for frame in half:
-            normal = normal.with_samples(points[frame], grey[frame], samples.weights[frame])
+        normal = assemble(grid, in_grey, points, among_frames(half, samples))
         shown.append(normal.through(normal.solve(UNTOLD, normal.mean(), _ITERATIONS))[0])
         densities.append(blur(normal.density(), _NEAR))
     both = torch.minimum(*densities) > _LEAST_DENSITY * torch.maximum(*densities).max()

@@ -66,7 +66,7 @@ def choose_smoothness(
     """
     window = _window(grid, scene)
     in_grey = replace(samples, values=samples.grey[..., None])
-    halves = [assemble(window, in_grey, points, _among(half, samples)) for half in (frames[::2], frames[1::2])]
+    halves = [assemble(window, in_grey, points, among_frames(half, samples)) for half in (frames[::2], frames[1::2])]
     densities = [blur(half.density(), 3.0) for half in halves]
     both = torch.minimum(*densities)
     sampled = (both > 0.2 * both.max()) & (both > 0)
@@ -100,7 +100,7 @@ def choose_among_neighbours(
     Parameters are those of `choose_smoothness`; one frame is enough.
     """
     window = _window(grid, scene)
-    in_grey, taking_part = replace(samples, values=samples.grey[..., None]), _among(frames, samples)
+    in_grey, taking_part = replace(samples, values=samples.grey[..., None]), among_frames(frames, samples)
     count = samples.weights.shape[1]
     fold = torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
     risks = np.zeros(len(_STILL_CANDIDATES))
@@ -112,7 +112,7 @@ def choose_among_neighbours(
     return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
 
 
-def _among(frames: NDArray[np.intp], samples: Samples) -> Tensor:
+def among_frames(frames: NDArray[np.intp], samples: Samples) -> Tensor:
     """Return which samples are of these frames, (T, 1) bool."""
     among = torch.zeros(len(samples.weights), 1, dtype=torch.bool)
     among[torch.from_numpy(frames)] = True
