@@ -176,7 +176,9 @@ def with_earlier(about: Row, before: Row) -> Row:
     if before and not _is_same_machine(before, about):
         latest = {name: value for name, value in before.items() if name != "earlier"}
         earlier.append({**latest, "until": about["date"]})
-    differing = [one for one in earlier if not _is_same_machine(one, about)]
+    # A folder that was published, continued and published again brings the same run twice.
+    once = [one for number, one in enumerate(earlier) if one not in earlier[:number]]
+    differing = [one for one in once if not _is_same_machine(one, about)]
     return {**about, "earlier": differing} if differing else about
 
 

@@ -13,7 +13,16 @@ from benchmarks.chart import PLACES, Shown, period_of
 from benchmarks.compare import compare, score
 from benchmarks.methods import METHODS, Effort, PeerError
 from benchmarks.recorded import measure_recorded
-from benchmarks.results import CONDITIONS, RECORDED, SCENES, Recorder, Results, write_start_curves
+from benchmarks.results import (
+    CONDITIONS,
+    MACHINE,
+    RECORDED,
+    SCENES,
+    Recorder,
+    Results,
+    with_earlier,
+    write_start_curves,
+)
 
 from benchmarks import __main__ as command
 from benchmarks import cases, chart, methods, publish, published_start, report, results
@@ -446,3 +455,10 @@ def test_faults_change_nothing_but_the_recording():
         np.testing.assert_array_equal(faulty.homographies, clean.homographies)
         assert not np.array_equal(faulty.burst.frames, clean.burst.frames)
     assert len({case.name for case in cases.recorded()}) == len(cases.recorded()) == 62
+
+
+def test_a_machine_that_is_told_of_twice_stands_once():
+    machine = dict.fromkeys(MACHINE, "A")
+    old = {**dict.fromkeys(MACHINE, "B"), "date": "2026-01-01", "until": "2026-01-02"}
+    now = {**machine, "date": "2026-01-03", "earlier": [old]}
+    assert with_earlier(now, now)["earlier"] == [old]
