@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
 from napari_fiberburst import Burst, Control, load, reconstruct
 from napari_fiberburst.errors import BundleError, SettingsError
 from napari_fiberburst.quality import motion_error, psnr, ssim
-from napari_fiberburst.simulation import Camera, simulate
+from napari_fiberburst.simulation import Camera, Faults, simulate
 
 SHAPE = (127, 141)
 
@@ -82,6 +83,30 @@ def test_the_same_call_twice_gives_the_same_bits(cores, fitted):
     again = reconstruct(cores.burst, preview_every=1e-9, fill=True)
     np.testing.assert_array_equal(again.image, fitted.image)
     np.testing.assert_array_equal(again.homographies, fitted.homographies)
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        Faults(),
+        Faults(deformation=3.0, flicker=0.05, intruder=0.05),
+        Faults(vignette=3.0, field=0.9, overlay=True, bundle_shift=1.0),
+    ],
+)
+def test_the_same_bits_with_any_number_of_threads(faults, same):
+    # Large enough for torch to share sums, products and transforms out among threads.
+    burst = simulate("histology", shape=(211, 243), frames=12, physics="core", pitch=4.6, faults=faults, seed=4).burst
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            results.append(reconstruct(burst))
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        same(result, results[0])
+        np.testing.assert_array_equal(result.uncertainty, results[0].uncertainty)
+        assert result.quality == results[0].quality
 
 
 def test_a_saved_scene_draws_the_same_again(cores, fitted, tmp_path):

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.pitch import find_pitch, ring_frequency
 from napari_fiberburst.bundle.samples import Samples, exposed
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 
 # Pixels, how far the bundle may have moved since the frames before.
@@ -123,7 +124,7 @@ def find_mount(grey: Tensor) -> Mount | None:
     gain = patterns.power(offsets) / patterns.power(torch.zeros_like(offsets))
     if gain < max(_LEAST_GAIN, 1 + _LEAST_GAIN_OF_FRAMES / len(used)) or patterns.ring(offsets) < _LEAST_RING:
         return None
-    agreement = (patterns.moved_back(offsets) * patterns.others(offsets).conj()).real.sum(dim=1)
+    agreement = steady.complex_product(patterns.moved_back(offsets), patterns.others(offsets).conj()).real.sum(dim=1)
     shows = agreement > _LEAST_OF_USUAL * agreement.median()
     used, offsets = used[shows.cpu().numpy()], offsets[shows]
     before = np.searchsorted(used, np.arange(len(grey)), side="right") - 1
@@ -161,7 +162,7 @@ class _Patterns:
         height, width = images.shape[1:]
         *envelopes, mass = blur(torch.cat([images, torch.ones_like(images[:1])]), _ENVELOPE * pitch)
         envelope = torch.stack(envelopes) / mass.clamp_min(1e-4)
-        flat = images / (envelope + _LEAST_LIGHT * envelope.mean()).clamp_min(1e-9) - 1
+        flat = images / (envelope + _LEAST_LIGHT * steady.mean(envelope)).clamp_min(1e-9) - 1
         usual = flat.abs().flatten(1).median(dim=1).values[:, None, None]
         flat = flat.clamp(-_MOST_OF_USUAL * usual, _MOST_OF_USUAL * usual)
         rows, columns = (torch.hann_window(side, periodic=False).to(images) for side in (height, width))
@@ -180,7 +181,7 @@ class _Patterns:
 
     def moved_back(self, offsets: Tensor) -> Tensor:
         """Return the spectra of images whose bundles were `offsets` (T, 2) away, moved to where these are 0."""
-        return self.spectra * _waves(offsets @ self.frequencies.T)
+        return steady.complex_product(self.spectra, _waves(offsets @ self.frequencies.T))
 
     def others(self, offsets: Tensor) -> Tensor:
         """Return for each image the sum of all others, moved back."""
@@ -189,24 +190,24 @@ class _Patterns:
 
     def power(self, offsets: Tensor) -> float:
         """Return the power that the mean of the images moved back has beyond what unlike images leave of themselves."""
-        total = self.moved_back(offsets).sum(dim=0).abs().square().sum()
-        return float(total - self.spectra.abs().square().sum())
+        together = self.moved_back(offsets).sum(dim=0)
+        return float(steady.total(together.abs().square()) - steady.total(self.spectra.abs().square()))
 
     def ring(self, offsets: Tensor) -> float:
         """Return how far the ring stands out of the mean of the images moved back, in parts of the power beside it."""
         power = self.moved_back(offsets).sum(dim=0).abs().square()
         distance = self.frequencies.norm(dim=1) / (2 * math.pi * self.ring_frequency)
         near, beside = (distance - 1).abs() < _RING, (distance > _BESIDE[0]) & (distance < _BESIDE[1])
-        return float(power[near].mean() / power[beside].mean())
+        return float(steady.mean(power[near]) / steady.mean(power[beside]))
 
     def searched(self, number: int, mean: Tensor) -> Tensor:
         """Return where a frame's bundle is relative to that of a mean spectrum (K,), (2,)."""
-        product = self.spectra[number] * mean.conj()
+        product = steady.complex_product(self.spectra[number], mean.conj())
         # Half a pixel apart, because where cores are three pixels apart, the peak is narrower than a pixel.
         between = torch.tensor([[x, y] for y in (0.0, 0.5) for x in (0.0, 0.5)]).to(self.frequencies)
         spectra = torch.zeros(len(between), *self.band.shape, dtype=mean.dtype, device=mean.device)
-        spectra[:, self.band] = product * _waves(between @ self.frequencies.T)
-        correlations = torch.fft.irfft2(spectra, s=self.shape).roll((MOST_OFFSET, MOST_OFFSET), (1, 2))
+        spectra[:, self.band] = steady.complex_product(product, _waves(between @ self.frequencies.T))
+        correlations = steady.irfft2(spectra, self.shape).roll((MOST_OFFSET, MOST_OFFSET), (1, 2))
         near = correlations[:, : 2 * MOST_OFFSET + 1, : 2 * MOST_OFFSET + 1]
         which, row, column = np.unravel_index(int(near.argmax()), near.shape)
         start = between[which] + torch.tensor([column - MOST_OFFSET, row - MOST_OFFSET]).to(between)
@@ -214,14 +215,14 @@ class _Patterns:
 
     def refined(self, means: Tensor, offsets: Tensor) -> Tensor:
         """Return where the frames' bundles are relative to those of mean spectra (T, K), near `offsets` (T, 2)."""
-        return self._climbed(self.spectra * means.conj(), offsets)
+        return self._climbed(steady.complex_product(self.spectra, means.conj()), offsets)
 
     def _climbed(self, products: Tensor, offsets: Tensor) -> Tensor:
         """Climb correlations, of which (T, K) are the spectra, by Newton's steps from `offsets` (T, 2)."""
         x, y = self.frequencies.T
         second = torch.stack([x * x, x * y, x * y, y * y], dim=1)
         for _ in range(_STEPS):
-            waves = products * _waves(offsets @ self.frequencies.T)
+            waves = steady.complex_product(products, _waves(offsets @ self.frequencies.T))
             slope, curvature = -waves.imag @ self.frequencies, (waves.real @ second).reshape(-1, 2, 2)
             # Beside a peak there may be none in reach: then it is better to stay.
             is_peak = (torch.linalg.det(curvature) > 0) & (curvature[:, 0, 0] > 0)

@@ -12,6 +12,7 @@ from torch import Tensor
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.samples import SATURATED, BundleTensors, Samples
 from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.operators import steady
 
 # Only pixels that pass at least this part of a bright core's light are asked, and at most so many of them.
 _LIT = 0.3
@@ -99,13 +100,13 @@ def _line(light: Tensor, square: Tensor, count: int) -> Noise | None:
         return None
     order = light.argsort()
     parts = torch.tensor_split(order, _STEPS)
-    x = torch.stack([light[part].mean() for part in parts])
+    x = torch.stack([steady.mean(light[part]) for part in parts])
     # The median of a mean of squares is a little below their mean (Wilson and Hilferty, 1931).
     freedom = max(1, count - 2)
     y = torch.stack([square[part].median() for part in parts]) / (1 - 2 / (9 * freedom)) ** 3
     weight = 1 / y.clamp_min(1e-12)
     design = torch.stack([x, torch.ones_like(x)], dim=1) * weight[:, None]
-    shot, read = torch.linalg.lstsq(design, (y * weight)[:, None]).solution[:, 0].tolist()
+    shot, read = torch.linalg.solve(design.T @ design, design.T @ (y * weight)).tolist()
     if shot < 0:
         return Noise(shot=0.0, read=float(y.mean()))
     if read < 0:

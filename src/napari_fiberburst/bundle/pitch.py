@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import local_mean
 
 # Pitches looked for, pixels. Below, cores and pixels beat; above, a frame holds too few cores to tell.
@@ -90,7 +91,7 @@ def _radial_spectrum(image: Tensor, weight: Tensor) -> tuple[NDArray[np.float64]
     flat = image / (envelope + 1e-3 * image.max())
     window = torch.hann_window(height, device=image.device)[:, None] * torch.hann_window(width, device=image.device)
     window = window * weight
-    flat = (flat - (flat * window).sum() / window.sum()) * window
+    flat = (flat - steady.weighted_mean(flat, window)) * window
     power = torch.fft.rfft2(flat).abs().square().cpu()
     frequency = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)[None, :])
     bins = max(64, min(height, width) // 2)

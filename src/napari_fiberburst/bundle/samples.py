@@ -15,6 +15,7 @@ from torch import Tensor
 from napari_fiberburst.bundle.bundle import GUESSED_GAINS, Bundle
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
+from napari_fiberburst.operators import steady
 from napari_fiberburst.stored import Stored
 
 # Pixels that pass less than this part of a bright core's light say little.
@@ -90,9 +91,8 @@ class Samples(Stored):
     @property
     def contrast(self) -> Tensor:
         """Standard deviation of the grey values, by their weights; a scalar."""
-        mass = self.weights.sum().clamp_min(1e-9)
-        mean = (self.weights * self.grey).sum() / mass
-        return ((self.weights * (self.grey - mean).square()).sum() / mass).sqrt()
+        mean = steady.weighted_mean(self.grey, self.weights)
+        return steady.weighted_mean((self.grey - mean).square(), self.weights).sqrt()
 
     def without_gains(self, gains: Tensor) -> "Samples":
         """Return the samples with each core's gain (G,) or (G, C) taken out of their values."""
@@ -291,22 +291,23 @@ def shows_detail(
     labels, passed = known.labels[lit], known.transmission[lit]
     count = len(known.centres)
     area = torch.zeros(count).to(grey).index_add_(0, labels, passed**2).clamp_min(1e-9)
-    sums = torch.zeros(5, len(pixels)).to(grey)
+    moments = torch.zeros(5, len(pixels)).to(grey)
     needed = max(_LEAST_DETAIL_FRAMES, -(-_DETAIL_SAMPLES // max(1, len(pixels))))
     for number in range(0, len(grey), max(1, len(grey) // needed)):
         scene = predicted(number, pixels)
         mean = torch.zeros(count).to(grey).index_add_(0, labels, passed**2 * scene) / area
         core = cores.values[number, labels].mean(dim=-1)
         # Of a core in the dark nothing can be said in parts of its light.
-        floor = _LEAST_LIT_CORE * mean.mean()
+        floor = _LEAST_LIT_CORE * steady.mean(mean)
         usable = (scene > 0) & (cores.weights[number, labels] > 0) & (core > floor) & (mean[labels] > floor)
         weight = passed**2 * core.square() * usable
         expected = torch.where(usable, scene / mean[labels].clamp_min(1e-6) - 1, torch.zeros_like(scene))
         light = (grey[number][lit] - known.black) / passed
         shown = torch.where(usable, light / core.clamp_min(1e-6) - 1, torch.zeros_like(scene))
-        sums += weight * torch.stack([torch.ones_like(scene), expected, shown, expected * shown, expected * expected])
-    mass, expected, shown, both, square = sums
+        terms = [torch.ones_like(scene), expected, shown, expected * shown, expected * expected]
+        moments += weight * torch.stack(terms)
+    mass, expected, shown, both, square = moments
     mass = mass.clamp_min(1e-9)
-    agreement = float((both - expected * shown / mass).sum())
-    power = float((square - expected * expected / mass).sum())
+    agreement = float(steady.total(both - expected * shown / mass))
+    power = float(steady.total(square - expected * expected / mass))
     return power > 0 and agreement / power > _LEAST_DETAIL

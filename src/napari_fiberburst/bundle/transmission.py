@@ -11,6 +11,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import with_transmission
 from napari_fiberburst.bundle.samples import BundleTensors
 from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.operators import steady
 
 # Part of the mean squared light below which a pixel has seen too little to tell its transmission.
 _LEAST_LIGHT = 1e-3
@@ -43,8 +44,8 @@ def remeasure(bundle: Bundle, grey: Tensor, acquisition: Acquisition, predicted:
         light += (frame[own] - known.black) * expected
         power += expected**2
     transmission = torch.zeros_like(known.transmission)
-    enough = power > _LEAST_LIGHT * power.mean()
-    fallback = known.transmission[own] * (light[enough].sum() / power[enough].sum().clamp_min(1e-9))
+    enough = power > _LEAST_LIGHT * steady.mean(power)
+    fallback = known.transmission[own] * (steady.total(light[enough]) / steady.total(power[enough]).clamp_min(1e-9))
     transmission[own] = torch.where(enough, light / power, fallback)
     return with_transmission(bundle, transmission)
 

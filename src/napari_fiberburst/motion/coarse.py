@@ -16,6 +16,7 @@ from scipy.fft import next_fast_len
 from torch import Tensor
 
 from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur, local_mean
 from napari_fiberburst.operators.grid import Grid
 
@@ -98,7 +99,7 @@ def confidence(
     others = totals.sum(dim=0) - totals
     found = []
     for a, own, (light, mass), (own_light, own_mass) in zip(at, weights, others, totals, strict=True):
-        enough = a(mass) > 0.5 * own.mean()
+        enough = a(mass) > 0.5 * steady.mean(own)
         weight = own * enough * a.inside
         here = a(own_light) / a(own_mass).clamp_min(1e-9)
         there = a(light) / a(mass).clamp_min(1e-9)
@@ -107,13 +108,13 @@ def confidence(
 
 
 def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> float:
-    total = float(weight.sum())
+    total = float(steady.total(weight))
     if total <= 0:
         return 0.0
-    first = first - (weight * first).sum() / total
-    second = second - (weight * second).sum() / total
-    power = float((weight * first**2).sum() * (weight * second**2).sum())
-    return max(0.0, float((weight * first * second).sum()) / power**0.5) if power > 0 else 0.0
+    first = first - steady.total(weight * first) / total
+    second = second - steady.total(weight * second) / total
+    power = float(steady.total(weight * first**2) * steady.total(weight * second**2))
+    return max(0.0, float(steady.total(weight * first * second)) / power**0.5) if power > 0 else 0.0
 
 
 def _images(
@@ -124,7 +125,7 @@ def _images(
     at = Grid.over((0, 0, width - 1, height - 1), spacing).at(positions)
     light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
     mass = blur(torch.stack([at.adjoint(w) for w in weights]), sigma)
-    mask = mass > 0.2 * mass.mean()
+    mask = mass > 0.2 * steady.mean(mass)
     return _normalised(torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask), mask
 
 
@@ -197,8 +198,8 @@ class _Correlation:
 
     def _correlate(self, part: str, first: int, part_second: str, second: int) -> Tensor:
         """Return one part of an image correlated with another part of a second image, at every shift."""
-        spectrum = self._spectra[part][first].conj() * self._spectra[part_second][second]
-        correlated: Tensor = torch.fft.irfft2(spectrum, s=self._shape)
+        spectrum = steady.complex_product(self._spectra[part][first].conj(), self._spectra[part_second][second])
+        correlated: Tensor = steady.irfft2(spectrum, self._shape)
         return correlated
 
 

@@ -78,7 +78,8 @@ def restrict(problem: JointProblem, state: JointState) -> Restriction | None:
         follow = torch.linalg.solve(own, information[:, :dof, dof:])
         schur = information[:, dof:, dof:] - information[:, dof:, :dof] @ follow
         beyond, _ = _split(frames, basis, dof)
-        common = torch.linalg.lstsq(schur.sum(dim=0), torch.einsum("tij,tj->i", schur, beyond)[:, None]).solution[:, 0]
+        whole = schur.sum(dim=0) + 1e-9 * torch.eye(problem.dof - dof).double()
+        common = torch.linalg.solve(whole, torch.einsum("tij,tj->i", schur, beyond))
         shape = _exp(common[None], basis[dof:])[0]
         beyond, members = _split(torch.linalg.inv(shape) @ frames, basis, dof)
         need = float(torch.einsum("ti,tij,tj->", beyond, schur, beyond)) / ((len(beyond) - 1) * (problem.dof - dof))

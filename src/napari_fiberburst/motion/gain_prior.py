@@ -7,6 +7,7 @@ from torch import Tensor
 
 from napari_fiberburst.motion.linearised import huber
 from napari_fiberburst.motion.problem import JointProblem, JointState
+from napari_fiberburst.operators import steady
 
 # Gains farther from those given than so many times their median distance count as if they were there.
 _FAR = 6.0
@@ -37,14 +38,13 @@ def with_told_prior(problem: JointProblem, state: JointState) -> JointProblem:
     halves = [_told(problem, light, weights, used[first::2]) for first in (0, 1)]
     power = halves[0][1] + halves[1][1]
     mass = halves[0][1] * halves[1][1] / power.clamp_min(1e-12)
-    known = mass > 0.1 * mass.mean()
+    known = mass > 0.1 * steady.mean(mass)
     if not bool(known.any()):
         return problem
     first, second = (_centred(told[known], mass[known]) for told, _ in halves)
-    total = mass[known].sum()
-    common = float((mass[known] * first * second).sum() / total)
-    error = float((mass[known] * (first - second).square()).sum() / total) / 4
-    nominal = float((weights * residual.square()).sum() / weights.sum().clamp_min(1e-12) / power[known].mean())
+    common = float(steady.weighted_mean(first * second, mass[known]))
+    error = float(steady.weighted_mean((first - second).square(), mass[known])) / 4
+    nominal = float(steady.weighted_mean(residual.square(), weights) / steady.mean(power[known]))
     excess = max(error / max(nominal, 1e-12), 1.0)
     return replace(problem, gain_variance=max(common / excess, _LEAST_VARIANCE))
 
@@ -61,6 +61,6 @@ def _told(problem: JointProblem, light: Tensor, weights: Tensor, frames: Tensor)
 
 def _centred(told: Tensor, mass: Tensor) -> Tensor:
     """Return gains without what all have in common, and without extremes."""
-    left = told - (mass * told).sum() / mass.sum()
+    left = told - steady.weighted_mean(told, mass)
     far = _FAR * left.abs().median()
     return left.clamp(-far, far)

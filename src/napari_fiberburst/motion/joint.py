@@ -23,6 +23,7 @@ from torch import Tensor
 from napari_fiberburst.motion.linearised import Linearised, huber
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.motion.problem import COARSE, LEAST_DAMPING, JointProblem, JointState, Level
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Sampling
@@ -80,7 +81,7 @@ def enter(problem: JointProblem, state: JointState, level: Level, radius: float 
     footprint = None if radius is None else Footprint(grid, radius, device)
     moved = replace(state, grid=grid, scene=scene, footprint=footprint)
     light = grid.at(problem.points(moved.motion))(moved.filtered) * moved.exposures[:, None]
-    brightness = (problem.weights * light * problem.values).sum() / (problem.weights * light**2).sum()
+    brightness = steady.total(problem.weights * light * problem.values) / steady.total(problem.weights * light**2)
     return replace(moved, scene=scene * float(brightness))
 
 
@@ -206,8 +207,8 @@ def scattered_mean(sampling: Sampling, values: Tensor, weights: Tensor, sigma: f
     total = torch.stack([sampling.adjoint(values * weights), sampling.adjoint(weights)])
     near = blur(total, sigma)
     far = blur(near, 3 * sigma)
-    everywhere = total[0].sum() / total[1].sum().clamp_min(1e-12)
-    faint = 1e-3 * near[1].mean() + 1e-12
+    everywhere = steady.total(total[0]) / steady.total(total[1]).clamp_min(1e-12)
+    faint = 1e-3 * steady.mean(near[1]) + 1e-12
     filled = (far[0] + faint * everywhere) / (far[1] + faint)
     return (near[0] + faint * filled) / (near[1] + faint)
 

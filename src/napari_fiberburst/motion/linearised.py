@@ -8,6 +8,7 @@ from torch import Tensor
 
 from napari_fiberburst.motion.displacement import ControlWeights
 from napari_fiberburst.motion.problem import JointProblem, JointState, Level
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.cg import Blocks, conjugate_gradients
 from napari_fiberburst.operators.jacobian import ControlSlopes, GeneratorSlopes, JointJacobian
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE
@@ -251,7 +252,7 @@ def residuals(problem: JointProblem, jacobian: JointJacobian) -> tuple[Tensor, T
     residual = problem.values - jacobian.gains * jacobian.light
     weights = problem.weights * jacobian.sampling.inside
     weights = weights * huber(residual, weights)
-    return residual, weights, float((weights * residual**2).sum() / weights.sum().clamp_min(1e-12))
+    return residual, weights, float(steady.weighted_mean(residual**2, weights))
 
 
 def huber(residual: Tensor, weights: Tensor) -> Tensor:

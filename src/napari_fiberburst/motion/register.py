@@ -28,6 +28,7 @@ from napari_fiberburst.motion.problem import (
 from napari_fiberburst.motion.registration import GreyScene, Registration, unregistered
 from napari_fiberburst.motion.score import bending_score
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED, alone, judged, still, unexplained_part
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.steps import drain
 
@@ -310,8 +311,7 @@ def _unbiased_residual(bent: Registration, samples: Samples) -> float:
 def _light(samples: Samples, found: Registration) -> float:
     """Return the mean light of the samples of frames that take part, full scale 1."""
     samples = samples.weighted(torch.from_numpy(found.used))
-    mass = samples.weights.sum().clamp_min(1e-9)
-    return max(float((samples.grey * samples.weights).sum() / mass), _LEAST_LIGHT)
+    return max(float(steady.weighted_mean(samples.grey, samples.weights)), _LEAST_LIGHT)
 
 
 def _frame_weights(problem: JointProblem, state: JointState, used: NDArray[np.bool_]) -> NDArray[np.float32]:

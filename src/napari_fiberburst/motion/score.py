@@ -5,6 +5,7 @@ from dataclasses import replace
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.motion.linearised import linearise, residuals
 from napari_fiberburst.motion.problem import FINER, JointProblem, JointState
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.jacobian import ControlSlopes
 
 # In pitches: between the control points that are asked.
@@ -41,4 +42,4 @@ def bending_score(problem: JointProblem, state: JointState) -> float:
     information = score.new_empty(score.shape)
     information[:, 0], information[:, 1] = x, y
     known = information > _LEAST_INFORMATION * information[information > 0].median()
-    return float((score**2 / (information * variance).clamp_min(1e-20))[known].mean())
+    return float(steady.mean((score**2 / (information * variance).clamp_min(1e-20))[known]))

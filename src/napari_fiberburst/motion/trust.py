@@ -12,6 +12,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.motion.coarse import LEAST_CONFIDENCE, confidence
 from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.operators import steady
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ def unexplained_part(found: Registration, samples: Samples, noise: float) -> flo
     samples = samples.weighted(torch.from_numpy(found.used))
     values, weights = _evened(found, samples), samples.weights
     mean = (weights * values).sum(dim=0) / weights.sum(dim=0).clamp_min(1e-9)
-    change = float((weights * (values - mean).square()).sum() / weights.sum().clamp_min(1e-9))
+    change = float(steady.weighted_mean((values - mean).square(), weights))
     left = max(found.residual**2 - noise**2, 0.0)
     return float(np.sqrt(left / max(change - noise**2, left, 1e-12)))
 

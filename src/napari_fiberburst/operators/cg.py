@@ -5,6 +5,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from napari_fiberburst.operators import steady
+
 # Unknowns in blocks of any shapes, such as a scene, the motion of its frames, and gains.
 Blocks = tuple[Tensor, ...]
 # Looking at the error makes the host wait for the device.
@@ -71,14 +73,14 @@ def conjugate_gradients(
 
 def inner_of_blocks(first: Blocks, second: Blocks) -> Tensor:
     """Return the inner product over all blocks, a scalar."""
-    total: Tensor = sum((a * b).sum() for a, b in zip(first, second, strict=True))  # type: ignore[assignment]
+    total: Tensor = sum(steady.total(a * b) for a, b in zip(first, second, strict=True))  # type: ignore[assignment]
     return total
 
 
 def inner_of_images(first: Blocks, second: Blocks) -> Tensor:
     """Return the inner product of each of C images (C, H, W) with its counterpart, (C, 1, 1)."""
     (a,), (b,) = first, second
-    return (a * b).sum(dim=(-1, -2), keepdim=True)
+    return torch.stack([steady.total(product) for product in a * b])[:, None, None]
 
 
 def _add(blocks: Blocks, factor: Tensor, others: Blocks) -> Blocks:

@@ -6,6 +6,8 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
+from napari_fiberburst.operators import steady
+
 
 def blur(images: Tensor, sigma: float) -> Tensor:
     """Filter images (..., H, W) by a Gaussian of `sigma` nodes; outside is 0."""
@@ -16,7 +18,7 @@ def blur(images: Tensor, sigma: float) -> Tensor:
         for side, frequencies in zip(shape, (torch.fft.fftfreq, torch.fft.rfftfreq), strict=True)
     )
     spectrum = torch.fft.rfft2(images, s=shape) * (along_y[:, None] * along_x)
-    filtered: Tensor = torch.fft.irfft2(spectrum, s=shape)[..., : images.shape[-2], : images.shape[-1]]
+    filtered: Tensor = steady.irfft2(spectrum, tuple(shape))[..., : images.shape[-2], : images.shape[-1]]
     return filtered
 
 

@@ -7,6 +7,7 @@ import torch
 from scipy.fft import next_fast_len
 from torch import Tensor
 
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 
 # The rim of the disc is this soft, pixels, and drawn with this many points a node.
@@ -51,7 +52,7 @@ class Footprint:
     def __call__(self, images: Tensor) -> Tensor:
         """Return the filtered images, (..., H, W)."""
         spectrum = torch.fft.rfft2(images, s=self._padded) * self._response
-        filtered: Tensor = torch.fft.irfft2(spectrum, s=self._padded)[..., : self._shape[0], : self._shape[1]]
+        filtered: Tensor = steady.irfft2(spectrum, self._padded)[..., : self._shape[0], : self._shape[1]]
         return filtered
 
     def adjoint(self, images: Tensor) -> Tensor:

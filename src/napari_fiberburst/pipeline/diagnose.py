@@ -15,6 +15,7 @@ from napari_fiberburst.bundle.transmission import with_gains
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.context import frames_behind
@@ -149,8 +150,8 @@ def _held_to_others(
     followed = equations.through(equations.solve(scene.smoothness, equations.mean(), _PROBE_ITERATIONS))
     agreement = power = torch.zeros(()).to(points)
     for part in predict(wrong, points, scene.grid, followed):
-        agreement = agreement + (part.weights * (part.values * part.light)[:, 0]).sum()
-        power = power + (part.weights * part.values[:, 0] ** 2).sum()
+        agreement = agreement + steady.total(part.weights * (part.values * part.light)[:, 0])
+        power = power + steady.total(part.weights * part.values[:, 0] ** 2)
     free = min(max(1 - float(agreement / power.clamp_min(1e-12)), _LEAST_FREE), 1.0)
     return (1 + (ratios - 1) / free).clamp_min(0), weights * free
 
@@ -166,12 +167,12 @@ def _residuals(samples: Samples, points: Tensor, scene: Scene) -> tuple[Tensor, 
     total = mass = 0.0
     for number, values, light, weight in predict(samples, points, scene.grid, filtered):
         square = ((values - light) ** 2).mean(dim=1) * weight
-        sums, weights = (
+        of_cores, weights = (
             torch.zeros(samples.cores).to(filtered).index_add_(0, samples.core_index, part) for part in (square, weight)
         )
-        found[number] = torch.where(weights > 0, (sums / weights.clamp_min(1e-12)).sqrt(), found[number])
-        total += float(square.sum())
-        mass += float(weight.sum())
+        found[number] = torch.where(weights > 0, (of_cores / weights.clamp_min(1e-12)).sqrt(), found[number])
+        total += float(steady.total(square))
+        mass += float(steady.total(weight))
     return found, total / max(mass, 1e-12)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.operators import steady
 from napari_fiberburst.results.diagnostics import Quality
 from napari_fiberburst.scene.halves import disagreement
 from napari_fiberburst.scene.prediction import predict
@@ -189,7 +190,7 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
     return GoodnessOfFit(
         error=error / change,
         disagreement=halves / change,
-        misfit=float("nan") if variance is None else float(scaled[left.known].mean().sqrt()),
+        misfit=float("nan") if variance is None else float(steady.mean(scaled[left.known]).sqrt()),
         frame_misfit=tuple(of_frames.tolist()),
         core_misfit=of_cores.cpu().numpy().astype(np.float32),
         structure=structure,
@@ -273,7 +274,7 @@ def _residuals(scene: Scene, points: Tensor) -> _Residuals:
 
 
 def _mean(mass: Tensor, values: Tensor) -> float:
-    return float((mass * values).sum() / mass.sum().clamp_min(1e-9))
+    return float(steady.weighted_mean(values, mass))
 
 
 def _change(samples: Samples) -> float:
@@ -298,7 +299,10 @@ def _neighbours(left: _Residuals, samples: Samples) -> tuple[float, float]:
     first, second = torch.from_numpy(pairs[:: -(-len(pairs) // _PAIRS)].T.copy()).to(left.off.device)
     both = left.known[:, first] & left.known[:, second]
     one, other = (torch.where(both, left.changing[:, part], 0.0).double() for part in (first, second))
-    product, power = float((one * other).sum()), float((one.square().sum() * other.square().sum()).sqrt())
+    product, power = (
+        float(steady.total(one * other)),
+        float((steady.total(one.square()) * steady.total(other.square())).sqrt()),
+    )
     if power <= 0:
         return float("nan"), float("nan")
     return product / int(both.sum()), product / power
@@ -309,5 +313,5 @@ def _still_power(left: _Residuals) -> float:
     counts = left.known.sum(dim=0)
     often = counts >= _LEAST_FRAMES
     expected = left.changing.square().sum(dim=0)[often] / (counts[often] - 1)
-    total = float(expected.sum())
-    return float((left.still.square() * counts)[often].sum()) / total if total > 0 else float("nan")
+    total = float(steady.total(expected))
+    return float(steady.total((left.still.square() * counts)[often])) / total if total > 0 else float("nan")

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.prediction import predict
 
@@ -76,7 +77,7 @@ def refine_gains(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor)
     deviation = deviation - deviation[known].median(dim=0).values
     # Shrunk towards no difference, as the noise makes part of the variance (Wiener).
     noise = left / power.clamp_min(1e-9)
-    variance = (deviation[known].square().mean() - noise[known].mean()).clamp_min(0)
+    variance = (steady.mean(deviation[known].square()) - steady.mean(noise[known])).clamp_min(0)
     shrunk = deviation * variance / (variance + noise).clamp_min(1e-12)
     channels = (1 + torch.where(known[:, None], shrunk, torch.zeros_like(shrunk))).clamp(
         _LEAST_CHANNEL_GAIN, _MOST_CHANNEL_GAIN
@@ -106,14 +107,14 @@ def _compare(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> 
         weight = weights[:, None]
         agreement += weight * values * light
         power += weight * light**2
-        left = left + (weight * (values - light) ** 2).sum()
-        mass = mass + weight.sum() * light.shape[1]
+        left = left + steady.total(weight * (values - light) ** 2)
+        mass = mass + steady.total(weight) * light.shape[1]
     return agreement, power, left / mass.clamp_min(1e-9)
 
 
 def _shares(agreement: Tensor, power: Tensor, core_index: Tensor) -> Tensor:
     """Return each pixel's gain relative to its core's, (N,)."""
-    enough = power > _LEAST_LIGHT_OF_MEAN * power.mean()
+    enough = power > _LEAST_LIGHT_OF_MEAN * steady.mean(power)
     gain = torch.where(enough, agreement / power.clamp_min(1e-9), torch.ones_like(power))
     gain = gain.clamp(_LEAST_SHARE, _MOST_SHARE)
     total, mass = (

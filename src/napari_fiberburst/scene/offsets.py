@@ -16,6 +16,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.prediction import predict
 from napari_fiberburst.scene.solve import solve_quickly
@@ -106,39 +107,39 @@ def _told(samples: Samples, registration: Registration, least: float) -> Offsets
     points = registration.points(samples.positions)
     grid = Grid.around(points, _SPACING * samples.pitch, 2 * samples.pitch)
     scene = solve_quickly(samples, registration, grid, _SMOOTHNESS)
-    sums = torch.zeros(2, 5, *samples.values.shape[1:], dtype=torch.float64, device=points.device)
+    moments = torch.zeros(2, 5, *samples.values.shape[1:], dtype=torch.float64, device=points.device)
     for number, part in enumerate(predict(scene.samples, points, grid, scene.filtered)):
         off, weight = part.values - part.light, part.weights[:, None].expand_as(part.light)
         terms = (weight, weight * part.light, weight * part.light**2, weight * off, weight * off * part.light)
-        sums[number % 2] += torch.stack(terms).double()
-    (first, information), (second, more) = (_line(half) for half in sums)
-    both, whole = _line(sums.sum(dim=0))
+        moments[number % 2] += torch.stack(terms).double()
+    (first, information), (second, more) = (_line(half) for half in moments)
+    both, whole = _line(moments.sum(dim=0))
     mass = information * more / (information + more).clamp_min(1e-12)
     known = mass > _LEAST_INFORMATION * mass.median()
     if not bool(known.any()):
         return None
     mass = mass * known
-    total = mass.sum().clamp_min(1e-12)
+    total = steady.total(mass).clamp_min(1e-12)
     first, second = (_centred(part, mass) for part in (first, second))
-    variance = float((mass * first * second).sum() / total)
-    chance = float((mass * first * second).square().sum().sqrt() / total)
-    usual = float((sums[:, 1].sum() / sums[:, 0].sum().clamp_min(1e-12)).abs())
+    variance = float(steady.total(mass * first * second) / total)
+    chance = float(steady.total((mass * first * second).square()).sqrt() / total)
+    usual = float((moments[:, 1].sum() / moments[:, 0].sum().clamp_min(1e-12)).abs())
     if variance < max((least * usual) ** 2, _LEAST_SCORE * chance):
         return None
     # What both halves agree on is the offsets, and what they do not agree on is the error of each line (Wiener).
-    error = float((mass * (first - second).square()).sum() / total) / 4
+    error = float(steady.total(mass * (first - second).square()) / total) / 4
     scale = error * float((whole * known).sum() / known.sum())
     shrunk = _centred(both, mass) * variance / (variance + scale / whole.clamp_min(1e-12))
     light = torch.where(known, shrunk, torch.zeros_like(shrunk))
-    _, seen, power, _, agreement = sums.sum(dim=0)
+    _, seen, power, _, agreement = moments.sum(dim=0)
     change = ((agreement - light * seen).sum(dim=1) / power.sum(dim=1).clamp_min(1e-12)) + 1
     change = change.clamp(1 / _MOST_CHANGE, _MOST_CHANGE)
     return Offsets(light=light.to(samples.values), gains=(change / change.median()).to(samples.values))
 
 
-def _line(sums: Tensor) -> tuple[Tensor, Tensor]:
+def _line(moments: Tensor) -> tuple[Tensor, Tensor]:
     """Return the height of each core's line (N, C) where it sees no light, and how much is known of it."""
-    weight, light, power, off, agreement = sums
+    weight, light, power, off, agreement = moments
     slope_of_light = light / power.clamp_min(1e-12)
     information = weight - light * slope_of_light
     height = (off - slope_of_light * agreement) / information.clamp_min(1e-9)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 
 
@@ -64,6 +65,6 @@ def misfit(
     """Return the weighted sum of squares by which a scene misses samples, and the sum of the weights."""
     total = mass = torch.zeros((), dtype=torch.float64)
     for part in predict(samples, points, grid, filtered, among):
-        total = total + (part.weights[:, None] * (part.values - part.light) ** 2).sum().cpu().double()
-        mass = mass + part.weights.sum().cpu().double() * part.values.shape[1]
+        total = total + steady.total(part.weights[:, None] * (part.values - part.light) ** 2).cpu().double()
+        mass = mass + steady.total(part.weights).cpu().double() * part.values.shape[1]
     return float(total), float(mass)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import ring_correlation
@@ -78,7 +79,7 @@ def choose_smoothness(
     ]
     reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
     risks = [
-        float(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, sampled].mean())
+        float(steady.mean(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, sampled]))
         for first, second in zip(*paths, strict=True)
     ]
     weight, nearest = _lowest(np.array(risks), _CANDIDATES)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.gains import GainChange, refine_gains
 from napari_fiberburst.scene.outliers import find_outliers
@@ -139,7 +140,7 @@ def prediction_error(samples: Samples, registration: Registration, grid: Grid, *
     equations = assemble(grid, samples, points, (~left_out).to(points))
     coefficients = equations.solve(UNTOLD, equations.mean(), _DRAFT_ITERATIONS)
     missed, mass = misfit(samples, points, grid, equations.through(coefficients), left_out)
-    light = float((samples.grey * samples.weights).sum() / samples.weights.sum().clamp_min(1e-9))
+    light = float(steady.weighted_mean(samples.grey, samples.weights))
     return (missed / mass) ** 0.5 / max(light, 1e-9) if mass > 0 else math.inf
 
 

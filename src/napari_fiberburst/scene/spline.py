@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_images
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.footprint import Footprint
@@ -151,8 +152,9 @@ class NormalEquations:
             What it was solved with.
         """
         density = self.density()
-        mean = float(density[density >= _LEAST_DENSITY * density.max()].mean())
-        _, right, below, below_right, below_left = self.stencil.bands.sum(dim=(1, 2)) / density.sum().clamp_min(1e-12)
+        mean = float(steady.mean(density[density >= _LEAST_DENSITY * density.max()]))
+        bands = torch.stack([steady.total(band) for band in self.stencil.bands])
+        _, right, below, below_right, below_left = bands / steady.total(density).clamp_min(1e-12)
         ties = below_right + below_left
         padded = torch.nn.functional.pad(scene[None], (_RIM,) * 4, mode="replicate")[0]
         height, width = padded.shape[-2:]
@@ -162,13 +164,13 @@ class NormalEquations:
         passed = mean * self._transfer(along_y, along_x) ** 2
         prior = self._weight(smoothness) * self.prior.response(along_y, along_x)
         ideal = (passed * square + prior) / (gain * (passed + prior)).clamp_min(1e-12)
-        shown: Tensor = torch.fft.irfft2(torch.fft.rfft2(padded) * ideal, s=(height, width))
+        shown: Tensor = steady.irfft2(torch.fft.rfft2(padded) * ideal, (height, width))
         return shown[..., _RIM:-_RIM, _RIM:-_RIM]
 
     def mean(self) -> Tensor:
         """Return an even scene of the right brightness, (C, H, W)."""
-        mass = self.stencil.bands[0].sum() + 2 * self.stencil.bands[1:].sum()
-        level = self.rhs.sum(dim=(1, 2)) / mass.clamp_min(1e-12)
+        mass = steady.total(self.stencil.bands[0]) + 2 * steady.total(self.stencil.bands[1:])
+        level = torch.stack([steady.total(channel) for channel in self.rhs]) / mass.clamp_min(1e-12)
         return level[:, None, None].expand(-1, *self.grid.shape).clone()
 
     def density(self) -> Tensor:
