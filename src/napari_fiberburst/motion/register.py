@@ -41,8 +41,10 @@ _MOST_SWELLING = 3.0
 # Pixels: iterations at a level end where no frame's centre moves farther than this.
 _ENOUGH = 0.015
 # Frames may bend where their residuals ask for it by the first score, or by the second and leave more unexplained than
-# this; and do where that leaves at most this part of the residuals.
+# this; and do where that leaves at most this part of the residuals. Where the registration has failed, by the third:
+# what wrong gains leave has less structure than noise (0.2 to 0.3), and what far bending leaves has more.
 _CLEAR_SCORE, _SCORE, _UNEXPLAINED_BY_PLANES, _MOST_LEFT_BY_BENDING = 3.0, 1.6, 0.14, 0.9
+_SCORE_OF_FAILURE = 0.4
 # Degrees of freedom of a homography.
 _MOST_FREEDOM = 8
 # Of full scale: the mean light that values are divided by, at least.
@@ -233,10 +235,10 @@ class _Search:
         if found.scene is None or self._is_spent(found):
             return False
         unexplained = unexplained_part(found, self.samples, self.noise)
-        if unexplained > MOST_UNEXPLAINED:
-            return True
         problem = self._problem(found, found.scene.light, None)
         score = bending_score(problem, self._resumed(found, found.scene, problem))
+        if unexplained > MOST_UNEXPLAINED:
+            return score > _SCORE_OF_FAILURE
         return score > (_SCORE if unexplained > _UNEXPLAINED_BY_PLANES else _CLEAR_SCORE)
 
     def restricted(self, found: Registration, most: int | None) -> Registration:
