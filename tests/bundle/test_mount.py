@@ -104,3 +104,13 @@ def test_frames_that_moved_by_whole_pixels_are_as_recorded():
     offsets = np.array([[0, 0], [0.02, -0.01], [1, 2.01], [0.5, 0], [-1, 0], [0, 0.3]])
     assert Mount(offsets).exact.tolist() == [True, True, True, False, True, False]
     assert Mount(offsets[2:]).exact.all()
+
+
+def test_frames_whose_bundles_lie_close_have_it_in_one_place():
+    offsets = np.array([[0.0, 0.0], [0.04, -0.03], [0.5, 0.0], [0.02, 0.05], [0.46, 0.03], [0.5, 1.0]])
+    places = Mount(offsets).places
+    assert (places[[1, 3]] == places[0]).all()
+    assert places[4] == places[2]
+    assert len({places[0], places[2], places[5]}) == 3
+    # A bundle that drifts is not in one place for all its frames being near the next.
+    assert len(set(Mount(np.linspace(0, 1, 21)[:, None] * [1.0, 0.0]).places)) >= 5

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import shift
 from torch import Tensor
 
@@ -50,6 +51,8 @@ _LEAST_RING = 4.0
 _LEAST_OF_USUAL = 0.3
 # Pixels: a part of a pixel below which interpolation changes nothing; and frames without more that are enough.
 _LEAST_PART, _FEWEST_FRAMES = 0.05, 4
+# Pixels: bundles that lie no farther apart than this are in one place.
+_SAME_PLACE = 0.2
 # Frames are interpolated by a spline of this order.
 _SPLINE_ORDER: Final = 3
 
@@ -84,6 +87,14 @@ class Mount:
         parts = np.abs(self.offsets - self.offsets.round()).max(axis=1)
         near: NDArray[np.bool_] = parts < _LEAST_PART
         return near if near.sum() >= _FEWEST_FRAMES else np.ones_like(near)
+
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """(T,), the number of the place in which each frame has the bundle, from 0."""
+        if len(self.offsets) < 2:
+            return np.zeros(len(self.offsets), dtype=np.intp)
+        number: NDArray[np.intp] = fcluster(linkage(self.offsets, "complete"), _SAME_PLACE, "distance").astype(np.intp)
+        return number - 1
 
     def relative_to(self, frame: int) -> "Mount":
         """Return the same, from where the bundle is in another frame."""

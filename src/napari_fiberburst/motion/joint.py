@@ -152,7 +152,8 @@ def _level(problem: JointProblem, state: JointState) -> JointState:
     """Return the state with that slope of the gains over the field moved into scene and exposures which is none.
 
     A bundle is nearly even, so its gains have hardly any slope. Where the exposures vary no more than what is left of
-    it makes of them, they are the same for all frames, which tells the slope better.
+    it makes of them, they are the same for all frames, which tells the slope better. A bundle that moves on the camera
+    makes frames darker that had to be interpolated, so exposures are compared only where it is in the same place.
     """
     device, count = problem.positions.device, problem.cores
     mass = torch.bincount(problem.core_index, minlength=count).to(problem.positions)
@@ -162,11 +163,13 @@ def _level(problem: JointProblem, state: JointState) -> JointState:
     middle = places[measured].mean(dim=0)
     used = (problem.weights > 0).any(dim=1)
     centres = state.motion.apply(middle[None])[:, 0]
+    places_of_frames = torch.zeros(len(used), dtype=torch.int64) if problem.places is None else problem.places.cpu()
     slope = _slope(
         (places[measured] - middle).cpu().double(),
         state.gains[measured].log().cpu().double(),
         (centres - middle)[used].cpu().double(),
         state.exposures[used].log().cpu().double(),
+        places_of_frames[used.cpu()],
         min(_UNEVENNESS, problem.gain_variance**0.5),
     ).to(places)
     return replace(
@@ -177,12 +180,21 @@ def _level(problem: JointProblem, state: JointState) -> JointState:
     )
 
 
-def _slope(places: Tensor, log_gains: Tensor, shifts: Tensor, log_exposures: Tensor, unevenness: float) -> Tensor:
+def _slope(
+    places: Tensor, log_gains: Tensor, shifts: Tensor, log_exposures: Tensor, groups: Tensor, unevenness: float
+) -> Tensor:
     """Return the slope (2,) that is to be moved out of the gains (G,), at places (G, 2), and exposures (T,).
 
-    The gains may change by about `unevenness` from the middle of the field to its edge.
+    Exposures are compared within each group of frames (T,) alone. The gains may change by about `unevenness` from the
+    middle of the field to its edge.
     """
-    log_gains, log_exposures, shifts = (part - part.mean(dim=0) for part in (log_gains, log_exposures, shifts))
+    log_gains = log_gains - log_gains.mean(dim=0)
+    log_exposures, shifts = log_exposures.clone(), shifts.clone()
+    numbers = set(groups.tolist())
+    for number in numbers:
+        members = groups == number
+        for part in (log_exposures, shifts):
+            part[members] -= part[members].mean(dim=0)
     information = places.T @ places + 1e-9 * torch.eye(2).double()
     by_gains = torch.linalg.solve(information, places.T @ log_gains)
     covariance = torch.linalg.inv(information) * (log_gains - places @ by_gains).square().mean()
@@ -190,7 +202,7 @@ def _slope(places: Tensor, log_gains: Tensor, shifts: Tensor, log_exposures: Ten
     information = torch.linalg.inv(covariance + (unevenness / half) ** 2 * torch.eye(2).double())
     left = log_exposures - shifts @ by_gains
     by_chance = (shifts @ torch.linalg.inv(information) * shifts).sum()
-    variance = ((left.square().sum() - by_chance) / max(1, len(left) - 1)).clamp_min(_LEAST_FLICKER**2)
+    variance = ((left.square().sum() - by_chance) / max(1, len(left) - len(numbers))).clamp_min(_LEAST_FLICKER**2)
     moments = shifts.T @ shifts / variance
     slope: Tensor = by_gains + torch.linalg.solve(information + moments, shifts.T @ left / variance)
     return slope

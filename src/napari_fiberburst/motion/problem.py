@@ -95,6 +95,8 @@ class JointProblem:
         Of the gains about 1, as far as it is known beforehand; 0 where they stay as they are.
     controls : ControlWeights or None
         From the control points of displacements to the samples; None where frames do not bend.
+    places : Tensor or None
+        (T,) int64, the place that the bundle has in each frame, where it moves on the camera.
     """
 
     positions: Tensor
@@ -106,6 +108,7 @@ class JointProblem:
     dof: int
     gain_variance: float = GUESSED_GAINS
     controls: ControlWeights | None = None
+    places: Tensor | None = None
 
     def without(self, frames: Tensor) -> "JointProblem":
         """Return the problem without the frames that are marked, (T,) bool."""

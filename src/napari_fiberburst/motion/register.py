@@ -116,9 +116,16 @@ def refine(
 
 
 def registering(
-    samples: Samples, *, dof: int | None, bends: bool | None, noise: float, iterations: int | None, seed: int
+    samples: Samples,
+    *,
+    dof: int | None,
+    bends: bool | None,
+    noise: float,
+    iterations: int | None,
+    seed: int,
+    places: NDArray[np.intp] | None = None,
 ) -> Generator[Registration, None, Registration]:
-    """Register as `register` does; yields what is known after each iteration."""
+    """Register as `register` does, with the places (T,) of a bundle that moves; yields after each iteration."""
     start = replace(unregistered(samples), dof=_MOST_FREEDOM if dof is None else dof)
     if len(samples.values) < 2:
         return alone(start, samples)
@@ -139,7 +146,7 @@ def registering(
     yield found
     if found.used.sum() < 2:
         return alone(found, samples)
-    search = _Search(samples=samples, shifts=moved, noise=noise, iterations=iterations, seed=seed)
+    search = _Search(samples=samples, shifts=moved, noise=noise, iterations=iterations, seed=seed, places=places)
     found = yield from search.refine(replace(found, stage="coarse"), (COARSE,), None, _COARSE_SAMPLES)
     found = replace(found, stage="fine")
     yield found
@@ -154,7 +161,13 @@ def registering(
 
 
 def refining(
-    samples: Samples, found: Registration, *, dof: int | None, iterations: int | None, seed: int
+    samples: Samples,
+    found: Registration,
+    *,
+    dof: int | None,
+    iterations: int | None,
+    seed: int,
+    places: NDArray[np.intp] | None = None,
 ) -> Generator[Registration, None, Registration]:
     """Refine a registration, and find the gains, by the final samples of the bundle; yields after each iteration.
 
@@ -168,11 +181,13 @@ def refining(
         As for `register`.
     iterations : int, optional
         Gauss-Newton iterations at most, those that `found` has had included.
+    places : numpy.ndarray, optional
+        (T,), the place that the bundle has in each frame, where it moves on the camera.
     """
     if found.scene is None or found.is_still:
         return found
     shifts = found.scene_from_frame[:, :2, 2].copy()
-    search = _Search(samples=samples, shifts=shifts, noise=0.0, iterations=iterations, seed=seed)
+    search = _Search(samples=samples, shifts=shifts, noise=0.0, iterations=iterations, seed=seed, places=places)
     levels, most = (FINE_PIXELS, _MOST_SAMPLES) if samples.kind == "pixels" else (FINE_CORES, None)
     found = yield from search.refine(found, levels, samples.radius, most)
     return search.restricted(found, most) if dof is None and found.displacement is None else found
@@ -187,6 +202,7 @@ class _Search:
     noise: float
     iterations: int | None
     seed: int
+    places: NDArray[np.intp] | None
 
     def refine(
         self, found: Registration, levels: tuple[Level, ...], radius: float | None, most: int | None
@@ -280,6 +296,7 @@ class _Search:
             dof=found.dof,
             gain_variance=samples.gain_variance,
             controls=None if found.displacement is None else found.displacement.grid.at(samples.positions[chosen]),
+            places=None if self.places is None else torch.from_numpy(self.places),
         )
 
     def _registered(self, found: Registration, problem: JointProblem, state: JointState, light: float) -> Registration:

@@ -22,6 +22,7 @@ from napari_fiberburst.bundle.samples import Samples, in_grey, sample_cores, sam
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.motion.places import places_with_gains, split_by_place, with_common_gains, with_gains_by_place
 from napari_fiberburst.motion.register import refining, registering
 from napari_fiberburst.motion.registration import Registration, unregistered
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
@@ -246,6 +247,7 @@ class Stages:
             noise=_typical_noise(fitted, self._burst, samples),
             iterations=self._method.iterations,
             seed=self._seed,
+            places=None if fitted.mount is None else fitted.mount.places,
         )
         while True:
             try:
@@ -341,19 +343,36 @@ class Stages:
         if outliers is not None:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples, outliers=outliers)
+        steps = self._refining(samples, registration, fitted.mount)
+        while True:
+            try:
+                registration, samples = next(steps)
+                fitted = replace(fitted, registration=registration, samples=samples)
+                yield fitted
+            except StopIteration as end:
+                registration, samples = end.value
+                return replace(fitted, registration=registration, samples=samples)
+
+    def _refining(
+        self, samples: Samples, registration: Registration, mount: Mount | None
+    ) -> Generator[tuple[Registration, Samples], None, tuple[Registration, Samples]]:
+        """Refine motion and gains; of a bundle that moves on the camera, the gains in each of its places."""
+        places = None if mount is None else mount.places
+        own = None if places is None or samples.kind != "cores" else places_with_gains(places)
         steps = refining(
-            samples,
-            registration,
+            samples if own is None else split_by_place(samples, own),
+            registration if own is None else with_gains_by_place(registration, own),
             dof=self._method.motion.dof,
             iterations=self._method.iterations,
             seed=self._seed,
+            places=places,
         )
         while True:
             try:
-                fitted = replace(fitted, registration=next(steps))
-                yield fitted
+                found = next(steps)
+                yield (found, samples) if own is None else with_common_gains(found, samples, own)
             except StopIteration as end:
-                return replace(fitted, registration=end.value)
+                return (end.value, samples) if own is None else with_common_gains(end.value, samples, own)
 
     def _outliers(self, fitted: Fitted) -> Tensor | None:
         """Return which cores show something else in which frames, (T, N), so far as that is clear; None if none do."""
