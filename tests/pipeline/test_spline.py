@@ -51,7 +51,8 @@ def test_what_is_known_comes_with_the_image(cores, fitted):
     # Off frame 0's own view coverage falls; about the middle all frames have looked.
     per_pixel = count * 12 * np.pi * fitted.bundle.radius**2 / np.prod(SHAPE)
     assert np.median(fitted.coverage) == pytest.approx(per_pixel, rel=0.4)
-    assert fitted.held_out_rmse == pytest.approx(np.sqrt(np.nanmean(fitted.residuals**2)), rel=0.6)
+    # Samples that the scene was solved from are missed by less than those left out, and both by about the noise.
+    assert 1 < fitted.held_out_rmse / np.sqrt(np.nanmean(fitted.residuals**2)) < 2
 
 
 def test_uncertainty_is_of_the_size_of_the_noise(cores, fitted):

@@ -86,3 +86,19 @@ def test_an_image_is_as_sharp_between_its_nodes_as_at_them():
 def test_an_image_of_nothing_is_finite():
     normal = NormalEquations.empty(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
     assert torch.isfinite(normal.image(normal.solve(0.1, normal.mean()), 0.1)).all()
+
+
+def test_a_solution_is_the_exact_one_to_a_part_of_its_finest_detail():
+    # Faint detail on bright ground, through a footprint that passes a third of it.
+    generator = torch.Generator().manual_seed(0)
+    grid, smoothness = Grid(0.0, 0.0, 1.0, SHAPE), 0.01
+    points = torch.rand(3000, 2, generator=generator) * torch.tensor([SHAPE[1] - 1, SHAPE[0] - 1])
+    values = 0.8 + 0.01 * (wave(points, 5.0) - 0.5) + 0.005 * torch.randn(3000, generator=generator)
+    empty = NormalEquations.empty(grid, 2.0, 1, torch.device("cpu"))
+    normal = empty.with_samples(points, values[:, None], torch.ones(3000))
+    nodes = torch.eye(SHAPE[0] * SHAPE[1]).reshape(-1, *SHAPE)
+    matrix = normal.through(normal.stencil(normal.through(nodes))) + smoothness * normal.prior(nodes)
+    exact = torch.linalg.solve(matrix.flatten(1).double(), normal.through(normal.rhs).flatten().double())
+    solution = normal.solve(smoothness, normal.mean(), 200)[0]
+    left = (solution - exact.reshape(SHAPE))[INSIDE]
+    assert float(left.std()) < 0.05 * float(exact.reshape(SHAPE)[INSIDE].std())
