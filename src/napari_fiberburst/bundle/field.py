@@ -42,11 +42,12 @@ _BAY = 0.025
 # The light fades out over a rim of so many pixels, or of this part of the shorter side if that is more.
 _RIM, _RIM_OF_SIDE = 6, 0.018
 
-# A mark changes less than this part of what changes about it (Gaussian of so many pixels, or of this part of the shorter
-# side), and less than this part of what those bright pixels change that hardly do (so many of them, where more than the
-# last part of the upper decile changes about them): these have noise.
-_STILL, _AROUND, _AROUND_OF_SIDE = 1 / 6, 12.0, 0.06
-_STILL_OF_NOISE, _HARDLY, _LIVELY = 0.5, 0.1, 0.25
+# A mark is brighter than what is about it (Gaussian of so many pixels, or of this part of the shorter side) and than
+# this part of a bright place. It changes less than the first part of what changes about it, and less than the second
+# part of what those bright pixels change that hardly do but do (so many of them, where more than the last part of the
+# upper decile changes about them): these have noise.
+_AROUND, _AROUND_OF_SIDE, _BRIGHT = 12.0, 0.06, 0.5
+_STILL, _STILL_OF_NOISE, _HARDLY, _LIVELY = 1 / 6, 0.5, 0.02, 0.25
 # Pixels that touch, and frames: fewer of either may stand still by chance.
 _LEAST_MARK, _LEAST_FRAMES = 4, 4
 # Pixels: edges of marks are soft.
@@ -105,9 +106,10 @@ def find_marks(frames: Tensor) -> Tensor:
         return none
     light, change = frames.mean(dim=0), frames.std(dim=0, correction=0)
     around = max(_AROUND, _AROUND_OF_SIDE * min(light.shape))
-    bright = (light > local_mean(light, around)) & (frames.amax(dim=0) < SATURATED)
+    least = _BRIGHT * float(np.quantile(light.cpu().numpy(), 0.95))
+    bright = (light > local_mean(light, around).clamp_min(least)) & (frames.amax(dim=0) < SATURATED)
     usual = local_mean(change, around)
-    lively = bright & (usual > _LIVELY * float(np.quantile(usual.cpu().numpy(), 0.9)))
+    lively = bright & (change > 0) & (usual > _LIVELY * float(np.quantile(usual.cpu().numpy(), 0.9)))
     if not bool(lively.any()):
         return none
     noise = float(np.quantile(change[lively].cpu().numpy(), _HARDLY))
