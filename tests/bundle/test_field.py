@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation
 
 from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.bundle.calibrate import calibrate
-from napari_fiberburst.bundle.field import find_field, without_rim
+from napari_fiberburst.bundle.field import find_field, find_marks, without_rim
 from napari_fiberburst.bundle.samples import sample
 from napari_fiberburst.quality import psnr
-from napari_fiberburst.simulation import SCENES, make_bundle, make_scene, simulate
+from napari_fiberburst.simulation import SCENES, Faults, make_bundle, make_scene, simulate
+from napari_fiberburst.simulation.field import overlay
 
 SHAPE = (211, 257)
 MIDDLE = np.array([128.0, 105.0])
@@ -202,3 +204,39 @@ def test_a_round_bundle_with_marks_about_it_has_cores_only_inside(is_cut):
     _, x = np.indices(SHAPE)
     inside = (from_middle() < 65) & ((x > 118) | (not is_cut))
     assert psnr(result.image[inside][None] / 255, truth[0][inside][None]) > 27
+
+
+def marked(scene, **more):
+    """Return a burst with a round field, a logo, a scale bar, and a cross within the field."""
+    faults = Faults(field=0.8, overlay=True)
+    return simulate(scene, shape=(157, 171), pitch=4.7, physics="core", faults=faults, seed=1, **more)
+
+
+@pytest.mark.parametrize("scene", ["histology", "tissue", "usaf"])
+def test_marks_are_found_with_their_edges_and_no_core_is_taken_for_one(scene):
+    made = marked(scene)
+    found = find_marks(grey(made.burst)).numpy()
+    burned_in = overlay(found.shape, 0.4 * found.shape[0])
+    assert found[burned_in].all()
+    assert not (found & ~binary_dilation(burned_in, np.ones((3, 3)))).any()
+
+
+@pytest.mark.parametrize("scene", ["histology", "tissue", "usaf"])
+def test_bursts_without_marks_have_none(scene):
+    assert not find_marks(grey(simulate(scene, shape=(101, 117), physics="core", seed=1).burst)).any()
+
+
+def test_a_mark_in_the_field_draws_no_spots_beside_it():
+    made = marked("tissue")
+    y, x = np.indices(made.visible.shape)
+    where = made.visible & (np.hypot(x - 85, y - 78) < 45)
+    image = reconstruct(made.burst, fill=True).image / 255
+    assert psnr(image[where][None], made.truth[0][where][None]) > 27
+
+
+def test_marks_are_left_out_of_a_known_bundle_too():
+    made, clean = marked("tissue"), simulate("tissue", shape=(157, 171), pitch=4.7, physics="core", seed=1)
+    found = find_marks(grey(made.burst)).numpy()
+    bundle = reconstruct(made.burst, bundle=reconstruct(clean.burst).bundle).bundle
+    assert (bundle.labels[found] == len(bundle.centres)).all()
+    assert not bundle.transmission[found].any()

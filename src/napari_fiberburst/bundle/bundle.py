@@ -235,6 +235,14 @@ class Bundle(Stored):
             outline=np.ascontiguousarray(self.outline[part]),
         )
 
+    def masked(self, hidden: NDArray[np.bool_]) -> Self:
+        """Return the bundle without those pixels that are hidden, (H, W) bool; cores stay with what is left of them."""
+        return replace(
+            self,
+            labels=np.where(hidden, np.int32(len(self.centres)), self.labels),
+            transmission=np.where(hidden, np.float32(0), self.transmission),
+        )
+
     def moved(self, frame_from_bundle: NDArray[np.float64]) -> Self:
         """Return the bundle as the camera sees it after it has moved.
 
@@ -355,13 +363,15 @@ class Bundle(Stored):
     def _placed_as(self, there: "Bundle") -> Self:
         """Return this bundle in the frames of another one that was made from it by `fitted_to` and `moved`.
 
-        What interpolation does to the brightness of cores is the same in both, so it is not taken for gain.
+        What interpolation does to the brightness of cores is the same in both, so it is not taken for gain; neither is
+        that a mark hides a part of a core in the other.
         """
         if "frame_from_bundle" not in there.provenance:
             return self
         placed = self.moved(np.array(there.provenance["frame_from_bundle"], dtype=np.float64))
         part = (slice(there.shape[0]), slice(there.shape[1]))
-        return replace(placed, transmission=placed.transmission[part], labels=placed.labels[part])
+        placed = replace(placed, transmission=placed.transmission[part], labels=placed.labels[part])
+        return placed.masked(there.labels == len(there.centres))
 
     def to_image(self) -> NDArray[np.uint8]:
         """Return the bundle as an image, (H, W, 3): transmission in grey, saturated cores red, dead ones blue."""

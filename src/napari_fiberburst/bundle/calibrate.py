@@ -17,7 +17,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
-from napari_fiberburst.bundle.field import find_field, widened, without_rim
+from napari_fiberburst.bundle.field import find_field, find_marks, widened, without_rim
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
 from napari_fiberburst.bundle.pitch import find_pitch, is_faint
 from napari_fiberburst.bundle.samples import SATURATED, exposed, sample_cores
@@ -39,6 +39,8 @@ _LEAST_CORES = 20
 _DARK = 0.04
 # The black level is this quantile of the mean frame: the space between cores, or outside the field.
 _BLACK_QUANTILE = 0.002
+# Pixels: over this much what lies under marks is filled in, for cores to be found beside them.
+_FILLED_FROM = 1.0
 # In pitches: a core's footprint before its profile has been measured.
 _USUAL_RADIUS = 0.36
 # The mean of few frames still shows an object of much contrast (standard deviation of a core's light over the frames,
@@ -69,16 +71,22 @@ def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
     True
     """
     frames = torch.from_numpy(burst.frames).to(find_device(device))
-    return drain(calibrating(frames.mean(dim=3), burst))
+    grey = frames.mean(dim=3)
+    return drain(calibrating(grey, burst, find_marks(grey[exposed(grey)])))
 
 
-def calibrating(grey: Tensor, acquisition: Acquisition) -> Generator[str, None, Bundle]:
-    """Calibrate the bundle from grey frames (T, H, W) in [0, 1]; yields the name of each step that is done."""
+def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Generator[str, None, Bundle]:
+    """Calibrate the bundle from grey frames (T, H, W) in [0, 1] with marks (H, W) burned into them.
+
+    Yields the name of each step that is done.
+    """
     origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
     grey = grey[exposed(grey)]
     mean = grey.mean(dim=0)
     field = find_field(grey, find_pitch(mean))
+    mean = torch.where(marks, local_mean(mean, _FILLED_FROM, (~marks).to(mean)), mean)
     bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin, field)), grey)
+    bundle = bundle.masked(marks.cpu().numpy())
     if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
         samples = sample_cores(grey[..., None], bundle, acquisition)
         light = samples.values[..., 0]

@@ -11,6 +11,7 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from napari_fiberburst.bundle.samples import SATURATED
 from napari_fiberburst.operators.filters import local_mean
 
 # Light, and how much it changes, are averaged over so many pixels, or pitches if that is more: gaps between cores are
@@ -40,6 +41,17 @@ _LEAST_FIELD = 0.1
 _BAY = 0.025
 # The light fades out over a rim of so many pixels, or of this part of the shorter side if that is more.
 _RIM, _RIM_OF_SIDE = 6, 0.018
+
+# A mark is brighter than what is about it (Gaussian of so many pixels, or of this part of the shorter side) and than
+# this part of a bright place. It changes less than the first part of what changes about it, and less than the second
+# part of what those bright pixels change that hardly do but do (so many of them, where more than the last part of the
+# upper decile changes about them): these have noise.
+_AROUND, _AROUND_OF_SIDE, _BRIGHT = 12.0, 0.06, 0.5
+_STILL, _STILL_OF_NOISE, _HARDLY, _LIVELY = 1 / 6, 0.5, 0.02, 0.25
+# Pixels that touch, and frames: fewer of either may stand still by chance.
+_LEAST_MARK, _LEAST_FRAMES = 4, 4
+# Pixels: edges of marks are soft.
+_SOFT = 1.5
 
 # Pixels within this of a hull's edge lie on it.
 _ON_EDGE = 1e-6
@@ -77,6 +89,36 @@ def find_field(frames: Tensor, pitch: float | None = None) -> Tensor:
     bays = ndimage.binary_opening(~(lit | changes), _disc(round(_BAY * min(hull.shape))))
     field = ~_joined_to_border(bays | ~hull)
     return torch.from_numpy(_large_parts(field)).to(frames.device)
+
+
+def find_marks(frames: Tensor) -> Tensor:
+    """Return what is burned into frames of a moving object, (H, W) bool: bright, and without even the camera's noise.
+
+    Saturated pixels are no marks: nobody takes light from them anyway.
+
+    Parameters
+    ----------
+    frames : Tensor
+        (T, H, W) in [0, 1], none of them black or white.
+    """
+    none = torch.zeros_like(frames[0], dtype=torch.bool)
+    if len(frames) < _LEAST_FRAMES:
+        return none
+    light, change = frames.mean(dim=0), frames.std(dim=0, correction=0)
+    around = max(_AROUND, _AROUND_OF_SIDE * min(light.shape))
+    least = _BRIGHT * float(np.quantile(light.cpu().numpy(), 0.95))
+    bright = (light > local_mean(light, around).clamp_min(least)) & (frames.amax(dim=0) < SATURATED)
+    usual = local_mean(change, around)
+    lively = bright & (change > 0) & (usual > _LIVELY * float(np.quantile(usual.cpu().numpy(), 0.9)))
+    if not bool(lively.any()):
+        return none
+    noise = float(np.quantile(change[lively].cpu().numpy(), _HARDLY))
+    still = bright & (change < _STILL * usual) & (change < _STILL_OF_NOISE * noise)
+    labels, _ = ndimage.label(still.cpu().numpy(), np.ones((3, 3)))
+    large = np.bincount(labels.ravel()) >= _LEAST_MARK
+    large[0] = False
+    marks = torch.from_numpy(large[labels]).to(frames.device)
+    return widened(marks, _SOFT) if bool(marks.any()) else none
 
 
 def without_rim(field: Tensor) -> Tensor:

@@ -15,10 +15,11 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
+from napari_fiberburst.bundle.field import find_marks, widened
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
-from napari_fiberburst.bundle.samples import Samples, in_grey, sample_cores, sample_pixels, shows_detail
+from napari_fiberburst.bundle.samples import Samples, exposed, in_grey, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
@@ -134,6 +135,7 @@ class Stages:
         self._burst, self._method, self._seed, self._given = burst, method, seed, given
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = in_grey(self._frames)
+        self._marks = find_marks(self._grey[exposed(self._grey)])
 
     def align(self) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register; None until the bundle is known."""
@@ -159,7 +161,7 @@ class Stages:
             self._grey = in_grey(self._frames)
             steadied = (_warned(mount.note),)
         yield None
-        bundle, notes = yield from self._calibrate()
+        bundle, notes = yield from self._calibrate(mount)
         samples = _seen(sample_cores(self._grey[..., None], bundle, self._burst), mount)
         fitted = Fitted(
             bundle=bundle,
@@ -218,9 +220,11 @@ class Stages:
             fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
         return self._sketched(replace(fitted, samples=self._in_colour(fitted)))
 
-    def _calibrate(self) -> Generator[None, None, tuple[Bundle, tuple[str, ...]]]:
+    def _calibrate(self, mount: Mount | None) -> Generator[None, None, tuple[Bundle, tuple[str, ...]]]:
+        # Marks rest in the frames as recorded, so they move about a bundle that was brought to rest.
+        marks = self._marks if mount is None else widened(self._marks, float(np.abs(mount.offsets).max()))
         if self._given is None:
-            steps = calibrating(self._grey, self._burst)
+            steps = calibrating(self._grey, self._burst, marks)
             while True:
                 try:
                     next(steps)
@@ -231,7 +235,7 @@ class Stages:
         else:
             placement = find_bundle(self._given.fitted_to(self._burst), self._grey, self._burst)
             yield
-            bundle = placement.bundle
+            bundle = placement.bundle.masked(marks.cpu().numpy())
             if placement.note:
                 return bundle, (_warned(placement.note),)
         bundle = self._flattened_by_frames(bundle)

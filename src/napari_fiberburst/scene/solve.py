@@ -21,8 +21,10 @@ from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
 
-# Iterations of conjugate gradients for a scene on the way, from an even one.
-_DRAFT_ITERATIONS = 25
+# Iterations of conjugate gradients, at most, for a scene on the way, from an even one. Gains and outliers are told by
+# that scene, so it has to have settled where few frames look, too: after 25 it has the colour of the mean at the rim of
+# a round field, which cores there would be given gains for.
+_DRAFT_ITERATIONS = 60
 PREVIEW_ITERATIONS = 12
 # Outliers are looked for so many times: in the first scene, they are in the scene too.
 _OUTLIER_ROUNDS = 2
