@@ -273,7 +273,9 @@ class Stages:
     def _is_start_in_doubt(self, fitted: Fitted) -> bool:
         """Whether the mean frame may have shown the object for gains: it hardly moves, or is not explained."""
         bundle, found = fitted.bundle, fitted.registration
-        if not bundle.is_resolved or bundle.gains_known or found.is_still or self._method.iterations is not None:
+        most = self._method.iterations
+        is_spent = most is not None and found.iterations >= most
+        if not bundle.is_resolved or bundle.gains_known or found.is_still or is_spent:
             return False
         return found.travel < _SHORT_TRAVEL * bundle.pitch or found.unexplained > MOST_UNEXPLAINED
 
