@@ -6,25 +6,30 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
-from napari_fiberburst.quality.resolution import ring_correlation
+from napari_fiberburst.quality.resolution import RingSpectra, correlation_of, ring_spectra
 from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.spline import NormalEquations, assemble
 
-# Smoothness is looked for among these, and between them: where halves of the burst tell, and where neighbours do.
-_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(1, -7, -1))
+# Smoothness is looked for among these where neighbours tell, and between them.
 _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
-# An image this rough has hardly any bias left: it stands for the truth that the other half's images are held to.
-_REFERENCE = 0.01
+# Where halves of the burst tell, it is looked for among these. Halves are solved with the last of some that fall off,
+# each started from the one before: so rough that even the finest detail is in them.
+_CANDIDATES = np.geomspace(10, 3e-4, 120)
+_OF_HALVES = (0.3, 0.03, 0.003)
+_ITERATIONS = 40
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
 # Smoothness is chosen in a window of at most this many nodes a side.
 _WINDOW = 224
+# Of waves that pass by less, nothing is known.
+_LEAST_TRANSFER = 1e-6
 # Every core is left out once, with so many others that most of its neighbours stay.
 _FOLDS = 6
 
@@ -48,11 +53,12 @@ class Smoothness:
 def choose_smoothness(
     samples: Samples, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
 ) -> Smoothness:
-    """Choose the smoothness by which each half of the burst best predicts the scene of the other.
+    """Choose the smoothness at which the scene's error is least, by how halves of the burst agree at each frequency.
 
-    Even and odd frames are solved apart. The squared difference between the scene from one half, at each smoothness,
-    and a nearly unbiased scene from the other is that scene's error plus a constant, because the halves' noise is
-    independent. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that matter.
+    Even and odd frames are solved apart and hardly smoothed. What their spectra have in common is the scene, what they
+    have not is noise, both as these solutions pass them; so it is known what error any other would have: see
+    `_expected_error`. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that
+    matter.
 
     Parameters
     ----------
@@ -73,20 +79,57 @@ def choose_smoothness(
     sampled = (both > 0.2 * both.max()) & (both > 0)
     if not bool(sampled.any()):
         return Smoothness(UNTOLD, None)
-    paths = [
-        [half.image(scene, smoothness) for smoothness, scene in zip(_CANDIDATES, _path(half, _CANDIDATES), strict=True)]
-        for half in halves
-    ]
-    reference = min(range(len(_CANDIDATES)), key=lambda index: abs(math.log(_CANDIDATES[index] / _REFERENCE)))
-    risks = [
-        float(steady.mean(((first - paths[1][reference]) ** 2 + (second - paths[0][reference]) ** 2)[:, sampled]))
-        for first, second in zip(*paths, strict=True)
-    ]
-    weight, nearest = _lowest(np.array(risks), _CANDIDATES)
+    rough = _OF_HALVES[-1]
+    first, second = (half.image(_path(half, _OF_HALVES)[-1], rough)[0].cpu().numpy() for half in halves)
     soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
-    first, second = (path[nearest][0].cpu().numpy() for path in paths)
-    resolution = window.spacing * ring_correlation(first, second, soft).resolution
+    spectra = ring_spectra(first, second, soft)
+    density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in halves]))
+    errors = _expected_error(spectra, *halves[0].responses(spectra.frequency), density, rough)
+    resolution = window.spacing * correlation_of(spectra).resolution
+    weight = float(_CANDIDATES[np.argmin(errors)]) if np.isfinite(errors).all() else UNTOLD
     return Smoothness(weight, resolution if math.isfinite(resolution) else None)
+
+
+def _expected_error(
+    spectra: RingSpectra,
+    passed: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    density: float,
+    rough: float,
+) -> NDArray[np.float64]:
+    """Return the error that a scene from both halves is expected to have at each candidate.
+
+    With the density c of samples, the footprint's response B and the prior's P, a solution passes the part
+    c B^2 / (c B^2 + lambda P) of a wave, and the noise sigma^2 c B^2 / (c B^2 + lambda P)^2 of samples (Wahba, "Spline
+    models for observational data", 1990, chapter 4). That is undone for the halves, and done for all samples, at twice
+    the density. A scene's spectrum falls off, which says what it is where the footprint lets nothing through; the noise
+    of samples is white.
+
+    Parameters
+    ----------
+    spectra : RingSpectra
+        Of the halves.
+    passed, prior : numpy.ndarray
+        (F,) B^2 and P at its frequencies.
+    density : float
+        Of a half, samples to a node.
+    rough : float
+        lambda of the halves.
+    """
+    # The lowest ring is what leaks from the mean and the window's edge.
+    count, passed, prior = spectra.count[1:], passed[1:], prior[1:]
+    common, noise = spectra.cross[1:], spectra.noise[1:]
+    stiff = density * passed + rough * prior
+    transfer = np.maximum(density * passed / stiff, _LEAST_TRANSFER)
+    trust = count * transfer**4 / (np.abs(common) + noise + np.finfo(float).tiny) ** 2
+    falling = isotonic_regression(common / transfer**2, weights=trust / trust.max(), increasing=False)
+    power = np.maximum(falling.x, 0)
+    of_samples = noise * stiff**2 / (density * np.maximum(passed, _LEAST_TRANSFER))
+    variance = np.sum(count * passed * of_samples) / np.sum(count * passed)
+    weight = _CANDIDATES[:, None] * prior
+    all_stiff = 2 * density * passed + weight
+    errors = (weight / all_stiff) ** 2 * power + 2 * density * passed * variance / all_stiff**2
+    return np.asarray(errors @ count)
 
 
 def choose_among_neighbours(
@@ -110,7 +153,7 @@ def choose_among_neighbours(
         asked = taking_part & (fold == left)
         for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
             risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]
-    return Smoothness(_lowest(risks, _STILL_CANDIDATES)[0] if risks.any() else UNTOLD, None)
+    return Smoothness(_lowest(risks, _STILL_CANDIDATES) if risks.any() else UNTOLD, None)
 
 
 def among_frames(frames: NDArray[np.intp], samples: Samples) -> Tensor:
@@ -125,21 +168,21 @@ def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor
     scene = normal.mean()
     scenes = []
     for smoothness in candidates:
-        scene = normal.solve(smoothness, scene, 40)
+        scene = normal.solve(smoothness, scene, _ITERATIONS)
         scenes.append(scene)
     return scenes
 
 
-def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> tuple[float, int]:
+def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> float:
     """Return the smoothness of least risk, by a parabola through the lowest candidate and its neighbours."""
     index = int(np.argmin(risks))
     exponents = np.log10(candidates)
     if not 0 < index < len(risks) - 1:
-        return candidates[index], index
+        return candidates[index]
     near = slice(index - 1, index + 2)
     curve = np.polyfit(exponents[near], np.log(risks[near] + 1e-300), 2)
     lowest = -curve[1] / (2 * curve[0]) if curve[0] > 0 else exponents[index]
-    return float(10 ** np.clip(lowest, exponents[index + 1], exponents[index - 1])), index
+    return float(10 ** np.clip(lowest, exponents[index + 1], exponents[index - 1]))
 
 
 def _window(grid: Grid, scene: Tensor) -> Grid:

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
@@ -193,6 +194,15 @@ class NormalEquations:
         density = blur(self.density(), reach / self.grid.spacing).clamp(1e-4, 1e3).cpu()
         deviation = np.interp(density.log10().numpy(), densities.log10().numpy(), table.sqrt().clamp(max=most).numpy())
         return torch.from_numpy(deviation).to(self.rhs)
+
+    def responses(self, frequency: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what the footprint passes of the power of waves (F,), cycles per node, and the prior at weight 1."""
+        # Halfway between an axis and a diagonal, a function with the grid's symmetry is close to its mean over angles.
+        along = torch.from_numpy(frequency).to(self.rhs)
+        along_y, along_x = along * math.sin(math.pi / 8), along * math.cos(math.pi / 8)
+        passed = self._transfer(along_y, along_x).diagonal() ** 2
+        prior = self._weight(1.0) * self.prior.response(along_y, along_x).diagonal()
+        return passed.double().cpu().numpy(), prior.double().cpu().numpy()
 
     def _weight(self, smoothness: float) -> float:
         """Return the prior's weight for nodes that are not a pixel apart."""
