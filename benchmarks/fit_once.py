@@ -1,20 +1,27 @@
-"""Fit one burst by whatever checkout PYTHONPATH names, for `benchmarks.side_by_side`.
+"""Fit one burst by whatever checkout PYTHONPATH names, for `benchmarks.side_by_side`, `benchmarks.speed` and others.
 
     python -P benchmarks/fit_once.py BURST.npz RESULT.npz
 
 Of napari_fiberburst it imports what all versions have. In: `frames` (T, H, W, C) as recorded, `black_level` and
-`white_level`, `scale`, image pixels to a frame pixel, and `device`. Out: `image`, frame 0's field, `seconds`
-without imports and reading, and `package`, the folder of the package that made it.
+`white_level`, `scale`, image pixels to a frame pixel, and `device`; `task`, if it is not "fit": "kept", for a bundle
+that is known from an earlier fit of the same burst, or "first picture", which ends with the first preview. Out:
+`image`, frame 0's field, `seconds` without imports and reading, `peak`, by how many bytes the fit has raised the most
+memory that the process has had, and `package`, the folder of the package that made it.
 """
 
+import resource
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 import napari_fiberburst
 from napari_fiberburst import Burst, reconstruct
+
+# Bytes to a unit of ru_maxrss.
+_UNIT = 1 if sys.platform == "darwin" else 1024
 
 
 def main() -> None:
@@ -22,17 +29,28 @@ def main() -> None:
     source, target = sys.argv[1:]
     with np.load(source) as file:
         inputs = {name: file[name] for name in file.files}
+    task = str(inputs.get("task", "fit"))
     burst = Burst(
         inputs["frames"],
         axes="TYXC",
         black_level=float(inputs["black_level"]),
         white_level=float(inputs["white_level"]),
     )
+    more: dict[str, Any] = {"device": str(inputs["device"]), "fill": True}
+    previews: list[float] = []
+    if task == "kept":
+        more["bundle"] = reconstruct(burst, **more).bundle
+    elif task == "first picture":
+        more["on_progress"] = lambda report: previews.extend([time.perf_counter()] * (report.preview is not None))
+        more["should_stop"] = lambda: bool(previews)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    result = reconstruct(burst, device=str(inputs["device"]), fill=True)
+    result = reconstruct(burst, **more)
     image = result.image if inputs["scale"] == 1 else result.render(scale=float(inputs["scale"]))
-    seconds = time.perf_counter() - start
-    np.savez(target, image=image, seconds=seconds, package=str(Path(napari_fiberburst.__file__).parent))
+    seconds = (previews[0] if previews else time.perf_counter()) - start
+    peak = _UNIT * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    package = str(Path(napari_fiberburst.__file__).parent)
+    np.savez(target, image=image, seconds=seconds, peak=peak, package=package)
 
 
 if __name__ == "__main__":

@@ -206,13 +206,22 @@ def compare(trial: Trial, other: Path, repeats: int) -> Pair:
     before, after = zip(*turns, strict=True)
     return Pair(
         name=trial.name,
-        quality=(trial.quality(before[-1][0]), trial.quality(after[-1][0])),
-        seconds=(min(seconds for _, seconds in before), min(seconds for _, seconds in after)),
+        quality=(trial.quality(before[-1].image), trial.quality(after[-1].image)),
+        seconds=(min(fit.seconds for fit in before), min(fit.seconds for fit in after)),
     )
 
 
-def fitted(checkout: Path, source: Path) -> tuple[NDArray[np.float32], float]:
-    """Return the image that a checkout makes of a burst, in a process of its own, and the seconds that it takes.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """The image that a checkout makes of a burst, the seconds that it takes, and the bytes of memory at most."""
+
+    image: NDArray[np.float32]
+    seconds: float
+    peak: float
+
+
+def fitted(checkout: Path, source: Path) -> Fit:
+    """Fit a burst by a checkout, in a process of its own.
 
     Raises
     ------
@@ -231,7 +240,7 @@ def fitted(checkout: Path, source: Path) -> tuple[NDArray[np.float32], float]:
         package = Path(str(found["package"]))
         if not package.resolve().is_relative_to(checkout.resolve()):
             raise FiberBurstError(f"expected the package of {checkout}; {package} was imported")
-        return found["image"], float(found["seconds"])
+        return Fit(image=found["image"], seconds=float(found["seconds"]), peak=float(found["peak"]))
 
 
 if __name__ == "__main__":
