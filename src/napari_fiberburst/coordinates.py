@@ -62,8 +62,9 @@ def transform_points(target_from_source: Any, points: Points) -> Points:
     >>> transform_points(shift, np.array([[1.0, 2.0]]))
     array([[4., 2.]])
     """
-    mapped = points @ target_from_source[..., :2].mT + target_from_source[..., None, :, 2]
-    found: Points = mapped[..., :2] / mapped[..., 2:]
+    # All x together and all y together, because products of long rows are several times as fast as of many pairs.
+    mapped = target_from_source[..., :2] @ points.mT + target_from_source[..., 2:]
+    found: Points = (mapped[..., :2, :] / mapped[..., 2:, :]).mT
     return found
 
 

@@ -56,16 +56,16 @@ def test_both_ways_take_the_same_steps(model, shape):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_tangent_is_how_points_move(model):
+def test_slopes_along_generators_are_how_a_plane_changes(model):
     points = torch.rand(30, 2) * torch.tensor([37.0, 31.0])
+    slope = torch.tensor([0.7, -0.4])
     for generator in range(model.dof):
         motion = FrameMotion.still(1, (31, 37))
         step = torch.zeros(1, model.dof)
         step[0, generator] = 1e-3
-        along_x, along_y = motion.tangent(points, model.dof)
-        moved = (motion.moved(step).apply(points)[0] - points) / 1e-3
-        expected = torch.stack([along_x[generator], along_y[generator]], dim=1)
-        torch.testing.assert_close(moved, expected, rtol=0.02, atol=0.05)
+        slopes = motion.slopes(points, *slope.expand(30, 2).T, model.dof)
+        change = (motion.moved(step).apply(points)[0] - points) @ slope / 1e-3
+        torch.testing.assert_close(change, slopes[generator], rtol=0.02, atol=0.05)
 
 
 def test_travel_is_how_far_the_middle_of_a_frame_goes():

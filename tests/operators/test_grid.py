@@ -25,7 +25,8 @@ def test_a_plane_is_sampled_exactly_and_has_its_slopes(grid, points):
     plane = 2 * nodes[..., 0] - 3 * nodes[..., 1] + 5
     at = grid.at(points)
     torch.testing.assert_close(at(plane), 2 * points[:, 0] - 3 * points[:, 1] + 5, rtol=0, atol=1e-4)
-    along_x, along_y = at.gradient(plane)
+    values, along_x, along_y = at.with_slopes(plane)
+    torch.testing.assert_close(values, at(plane), rtol=0, atol=1e-4)
     torch.testing.assert_close(along_x, torch.full_like(along_x, 2.0), rtol=0, atol=1e-4)
     torch.testing.assert_close(along_y, torch.full_like(along_y, -3.0), rtol=0, atol=1e-4)
 
@@ -35,6 +36,7 @@ def test_outside_there_is_nothing_to_sample_or_to_splat_on(grid):
     assert not at.inside.any()
     assert not at(torch.ones(grid.shape)).any()
     assert not at.adjoint(torch.ones(4)).any()
+    assert not any(part.any() for part in at.with_slopes(torch.rand(grid.shape)))
 
 
 def test_the_stencil_is_sample_then_weigh_then_splat(grid, points):

@@ -163,7 +163,8 @@ class _Correlation:
         # Most bursts have one mask for all frames, so what is correlated with it serves many pairs.
         numbers: dict[bytes, int] = {}
         self._mask_of = [numbers.setdefault(mask.cpu().numpy().tobytes(), i) for i, mask in enumerate(masks)]
-        self._kept = lru_cache(maxsize=_KEPT)(self._correlate)
+        self._overlap = lru_cache(maxsize=_KEPT)(self._overlap_of)
+        self._side = lru_cache(maxsize=_KEPT)(self._side_of)
         self._area = masks.sum(dim=(1, 2))
         self._power = centred.square().sum(dim=(1, 2))
         self._spectra = {
@@ -173,28 +174,42 @@ class _Correlation:
 
     def best(self, first: int, second: int) -> tuple[NDArray[np.float64], float]:
         """Return the shift (x, y) from the second image to the first, in their pixels, and its score."""
-        area = torch.minimum(self._area[first], self._area[second])
-        if not float(area) > 0:
+        if not float(torch.minimum(self._area[first], self._area[second])) > 0:
             return np.zeros(2), 0.0
         mask, mask_second = self._mask_of[first], self._mask_of[second]
-        overlap = self._kept("mask", mask, "mask", mask_second).clamp_min(1e-3)
-        sums = self._kept("value", first, "mask", mask_second)
-        sums_second = self._kept("mask", mask, "value", second)
-        power = self._kept("square", first, "mask", mask_second) - sums**2 / overlap
-        power_second = self._kept("mask", mask, "square", second) - sums_second**2 / overlap
-        joint = self._correlate("value", first, "value", second) - sums * sums_second / overlap
-        # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
-        share = overlap / area
-        norm = (power.clamp_min(0) + 0.02 * share * self._power[first]) * (
-            power_second.clamp_min(0) + 0.02 * share * self._power[second]
-        )
-        score = joint / norm.sqrt().clamp_min(1e-12) * share.clamp(0, 1) ** 0.25
-        score = torch.where(share > _LEAST_OVERLAP, score, torch.full_like(score, -1))
+        sums, scale = self._side(first, mask_second, True)
+        sums_second, scale_second = self._side(second, mask, False)
+        # Shifts that leave too little in common have the scale 0.
+        score = (self._correlate("value", first, "value", second) - sums * sums_second) * scale * scale_second
         place = int(score.argmax())
         shift = [place % self._shape[1], place // self._shape[1]]
         for axis, side in enumerate(self._shape[::-1]):
             shift[axis] -= side if shift[axis] > side // 2 else 0
-        return -np.array(shift, dtype=np.float64), max(0.0, float(score.max()))
+        return -np.array(shift, dtype=np.float64), max(0.0, float(score.reshape(-1)[place]))
+
+    def _overlap_of(self, mask: int, mask_second: int) -> tuple[Tensor, Tensor]:
+        """Return how many pixels two masks have in common at every shift, and as a part of the smaller one."""
+        overlap = self._correlate("mask", mask, "mask", mask_second).clamp_min(1e-3)
+        return overlap, overlap / torch.minimum(self._area[mask], self._area[mask_second])
+
+    def _side_of(self, image: int, other_mask: int, is_first: bool) -> tuple[Tensor, Tensor]:
+        """Return what one image of a pair makes of the correlation: its sums over the overlap, and a scale.
+
+        They depend on the other image's mask alone, so most pairs share them.
+        """
+        own_mask = self._mask_of[image]
+        masks = (own_mask, other_mask) if is_first else (other_mask, own_mask)
+        overlap, share = self._overlap(*masks)
+        sums, squares = (
+            self._correlate(part, image, "mask", other_mask)
+            if is_first
+            else self._correlate("mask", other_mask, part, image)
+            for part in ("value", "square")
+        )
+        # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
+        power = (squares - sums**2 / overlap).clamp_min(0) + 0.02 * share * self._power[image]
+        weight = torch.where(share > _LEAST_OVERLAP, share.clamp(0, 1) ** 0.125, torch.zeros_like(share))
+        return sums / overlap.sqrt(), weight / power.sqrt().clamp_min(1e-6)
 
     def _correlate(self, part: str, first: int, part_second: str, second: int) -> Tensor:
         """Return one part of an image correlated with another part of a second image, at every shift."""

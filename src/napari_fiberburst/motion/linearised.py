@@ -24,7 +24,9 @@ _EXPOSURE_VARIANCE = 0.01
 # displacement itself is held back.
 _CURVATURE, _RIDGE = 1.8, 1e-3
 # Of conjugate gradients: iterations at most, and the relative error at which they end. A Gauss-Newton step is only
-# right to first order, so solving it further gains nothing; displacements go through more levels instead.
+# right to first order, so solving it further gains nothing; displacements go through more levels instead. Motion is as
+# right after half as many iterations, but what scene and gains share is not: a slope of the gains would then be taken for
+# a shading of the light.
 _ITERATIONS, _BENDING_ITERATIONS, _TOLERANCE = 24, 12, 1e-2
 
 
@@ -211,19 +213,19 @@ def linearise(problem: JointProblem, state: JointState, level: Level) -> JointJa
     sampling, filtered = state.grid.at(points), state.filtered
     gains = state.gains[problem.core_index]
     factors = state.exposures[:, None] * gains
-    along_x, along_y = (slope * factors for slope in sampling.gradient(filtered))
+    light, along_x, along_y = sampling.with_slopes(filtered)
+    along_x, along_y = along_x * factors, along_y * factors
     motion: GeneratorSlopes | ControlSlopes
     if level.bends and problem.controls is not None:
         motion = ControlSlopes(along_x, along_y, problem.controls)
     else:
-        x, y = state.motion.tangent(points, min(level.dof, problem.dof))
-        motion = GeneratorSlopes(along_x.unsqueeze(1) * x + along_y.unsqueeze(1) * y)
+        motion = GeneratorSlopes(state.motion.slopes(points, along_x, along_y, min(level.dof, problem.dof)))
     return JointJacobian(
         sampling=sampling,
         footprint=state.footprint,
         gains=gains,
         exposures=state.exposures,
-        light=state.exposures[:, None] * sampling(filtered),
+        light=state.exposures[:, None] * light,
         motion=motion,
         core_index=problem.core_index,
         cores=problem.cores,

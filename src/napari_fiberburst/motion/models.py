@@ -134,18 +134,26 @@ class FrameMotion:
         displacement = Displacement(grid, torch.from_numpy(arrays["control"]))
         return cls(torch.from_numpy(arrays["scene_from_frame"]), (int(height), int(width)), displacement)
 
-    def tangent(self, points: Tensor, dof: int) -> tuple[Tensor, Tensor]:
-        """Return how scene points move, in pixels along x and y, per unit of each generator.
+    def slopes(self, points: Tensor, along_x: Tensor, along_y: Tensor, dof: int) -> Tensor:
+        """Return the slopes, per unit of each generator, of what has these slopes per pixel at scene points.
 
-        Points (..., N, 2) give (..., k, N).
+        Points (..., N, 2) and slopes (..., N) along x and y give (..., k, N).
         """
         height, width = self.shape
-        centre = torch.tensor([(width - 1) / 2, (height - 1) / 2])
-        x, y = ((points - centre.to(points)) / self._half).unbind(dim=-1)
-        one, zero = torch.ones_like(x), torch.zeros_like(x)
-        along_x = torch.stack([one, zero, -y, x, x, y, -x * x, -x * y][:dof], dim=-2)
-        along_y = torch.stack([zero, one, x, y, -y, x, -x * y, -y * y][:dof], dim=-2)
-        return along_x * self._half, along_y * self._half
+        x, y = (points[..., 0] - (width - 1) / 2) / self._half, (points[..., 1] - (height - 1) / 2) / self._half
+        along_x, along_y = along_x * self._half, along_y * self._half
+        radial = x * along_x + y * along_y
+        rows = [
+            along_x,
+            along_y,
+            x * along_y - y * along_x,
+            radial,
+            x * along_x - y * along_y,
+            y * along_x + x * along_y,
+            -x * radial,
+            -y * radial,
+        ]
+        return torch.stack(rows[:dof], dim=-2)
 
     def moved(self, steps: Tensor) -> "FrameMotion":
         """Return the motion with each frame moved by its step (T, k) along the generators."""

@@ -84,11 +84,11 @@ class Sampling:
 
     def __init__(self, grid: Grid, points: Tensor) -> None:
         rows, columns = grid.shape
-        place = (points - torch.tensor([grid.x0, grid.y0]).to(points)) / grid.spacing
-        last = torch.tensor([columns - 1, rows - 1]).to(points)
+        x, y = points.unbind(dim=-1)
+        x, y = (x - grid.x0) / grid.spacing, (y - grid.y0) / grid.spacing
         self.grid = grid
-        self.inside = ((place >= 0) & (place <= last)).all(dim=-1)  # NaN is outside
-        self._place = place
+        self.inside = (x >= 0) & (x <= columns - 1) & (y >= 0) & (y <= rows - 1)  # NaN is outside
+        self._place = x, y
 
     def __call__(self, image: Tensor) -> Tensor:
         """Return an image (H, W) at the points, (...)."""
@@ -102,14 +102,13 @@ class Sampling:
         """Return images (C, H, W) at the points, (..., C)."""
         return self._read(images).movedim(0, -1)
 
-    def gradient(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the image's slope per pixel along x and along y at the points; 0 outside."""
-        a, b, c, d = image.reshape(-1)[self._corners.index]
-        x, y = self._corners.x, self._corners.y
+    def with_slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the image at the points, and its slopes per pixel along x and along y there; 0 outside."""
+        index, x, y = self._corners.index, self._corners.x, self._corners.y
+        a, b, c, d = image.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
+        along_x, along_y = torch.lerp(b - a, d - c, y), torch.lerp(c - a, d - b, x)
         scale = self.inside / self.grid.spacing
-        along_x = torch.lerp(b - a, d - c, y) * scale
-        along_y = torch.lerp(c - a, d - b, x) * scale
-        return along_x, along_y
+        return torch.lerp(a, b, x).addcmul_(y, along_y).mul_(self.inside), along_x * scale, along_y * scale
 
     def normal_diagonal(self, weights: Tensor) -> Tensor:
         """Return the diagonal of S' W S, (H, W), S being this operator and W weights (...)."""
@@ -129,10 +128,11 @@ class Sampling:
     @cached_property
     def _normalised(self) -> Tensor:
         """The points in units of half the grid about its middle, (1, 1, M, 2), as torch samples images."""
-        rows, columns = self.grid.shape
-        half = torch.tensor([(columns - 1) / 2, (rows - 1) / 2]).to(self._place)
-        beyond = self._place.new_tensor(_BEYOND)
-        return torch.where(self.inside[..., None], self._place / half - 1, beyond).reshape(1, 1, -1, 2)
+        halves = ((side - 1) / 2 for side in reversed(self.grid.shape))
+        parts = [
+            torch.where(self.inside, part / half - 1, _BEYOND) for part, half in zip(self._place, halves, strict=True)
+        ]
+        return torch.stack(parts, dim=-1).reshape(1, 1, -1, 2)
 
     @cached_property
     def _corners(self) -> "_Corners":
@@ -176,10 +176,10 @@ class _Corners:
     weight: Tensor
 
     @classmethod
-    def of(cls, place: Tensor, inside: Tensor, shape: tuple[int, int]) -> "_Corners":
-        """Return the nodes about places (..., 2), in nodes from the first."""
+    def of(cls, place: tuple[Tensor, Tensor], inside: Tensor, shape: tuple[int, int]) -> "_Corners":
+        """Return the nodes about places (x and y, each (...)), in nodes from the first."""
         rows, columns = shape
-        x, y = (torch.where(inside, part, torch.zeros_like(part)) for part in place.unbind(dim=-1))
+        x, y = (torch.where(inside, part, torch.zeros_like(part)) for part in place)
         column, row = x.floor().clamp(max=columns - 2), y.floor().clamp(max=rows - 2)
         x, y = x - column, y - row
         first = row.long() * columns + column.long()
