@@ -33,20 +33,20 @@ def frames_behind(samples: Samples, points: Tensor, used: NDArray[np.bool_], can
     step = torch.from_numpy(canvas.reference_from_image[[0, 1], [0, 1]]).to(device)
     first = torch.from_numpy(canvas.reference_from_image[:2, 2]).to(device)
     height, width = canvas.shape
-    across, down = (math.ceil(radius / size) + 1 for size in step.tolist())
-    around = torch.cartesian_prod(torch.arange(-across, across + 1), torch.arange(-down, down + 1)).to(device)
-    count = torch.zeros(height * width, dtype=torch.int32, device=device)
+    across, down = (radius / step).tolist()
+    below = torch.arange(math.floor(2 * down) + 1, device=device)[:, None]
+    count = torch.zeros(height, width, dtype=torch.int32, device=device)
     for number in np.flatnonzero(used):
         places = (points[number, samples.weights[number] > 0].double() - first) / step
-        places = places[torch.isfinite(places).all(dim=1)]
-        nearest = places.round()
-        seen = torch.zeros(height * width, dtype=torch.bool, device=device)
-        for offset in around:
-            pixel = nearest + offset
-            reached = ((pixel - places) * step).norm(dim=1) <= radius
-            reached &= ((pixel >= 0) & (pixel < pixel.new_tensor([width, height]))).all(dim=1)
-            column, row = pixel[reached].long().unbind(dim=1)
-            seen[row * width + column] = True
-        count += seen
-    array: NDArray[np.int32] = count.reshape(height, width).cpu().numpy()
+        x, y = places[torch.isfinite(places).all(dim=1)].unbind(dim=1)
+        # A disc is one run of pixels in each row, so its ends are enough.
+        row = (y - down).ceil() + below
+        half = across * (1 - ((row - y) / down).square()).clamp_min(0).sqrt()
+        start, stop = (x - half).ceil().clamp(0, width), ((x + half).floor() + 1).clamp(0, width)
+        reached = (start < stop) & (row >= 0) & (row < height) & ((row - y).abs() <= down)
+        row, start, stop = (part[reached].long() for part in (row, start, stop))
+        ends = (row * (width + 1) + end for end in (start, stop))
+        begun, ended = (torch.bincount(end, minlength=height * (width + 1)) for end in ends)
+        count += (begun - ended).reshape(height, width + 1)[:, :width].cumsum(dim=1) > 0
+    array: NDArray[np.int32] = count.cpu().numpy()
     return array
