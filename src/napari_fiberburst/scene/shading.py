@@ -58,6 +58,8 @@ _RIDGE = 1e-4
 _LEAST_GAIN = (4.0, 2.0)
 # Shadings that are this even everywhere (ratio of the brightest to the darkest place, less 1) change nothing.
 _LEAST_SHADING = 0.02
+# Matrices over cells are dense, because products of sparse ones take several times as long; so many rows at once.
+_CELLS_AT_ONCE = 2**15
 # What the mean frame shows is smoothed by this weight of its curvature, for a core to each.
 _FRAME_CURVATURE = 1.0
 
@@ -191,12 +193,21 @@ class _Ratios:
         (T, N) number of the cell of the scene.
     within : numpy.ndarray
         (T, N, 2) where in its cell, (x, y) from the middle, pixels.
+    order, first : numpy.ndarray
+        (T * N,) the samples cell by cell, and where in it each cell begins, and the last one ends.
     """
 
     values: Array
     weights: Array
     cells: NDArray[np.int64]
     within: Array
+    order: NDArray[np.intp]
+    first: NDArray[np.intp]
+
+    def over_cells(self, values: Array, columns: NDArray[np.intp]) -> Any:
+        """Return the sparse sums of values (T, N) over cells (rows) and something else."""
+        entries = (values.ravel()[self.order], columns[self.order], self.first)
+        return sparse.csr_matrix(entries, shape=(len(self.first) - 1, int(columns.max()) + 1))
 
     def without_means(self, values: Array, weights: Array) -> Array:
         """Return values (T, N) of one channel without their weighted mean in each cell."""
@@ -271,8 +282,15 @@ def _compare(samples: Samples, registration: Registration) -> _Ratios:
     within = (places - places.floor() - 0.5) * (_CELL * samples.pitch)
     places = (places.floor() - places.floor().amin(dim=(0, 1))).long()
     number = places[..., 1] * (places[..., 0].max() + 1) + places[..., 0]
-    cells = torch.unique(number, return_inverse=True)[1]
-    return _Ratios(values=values, weights=weights, cells=cells.numpy(), within=within.double().numpy())
+    cells = torch.unique(number, return_inverse=True)[1].numpy()
+    return _Ratios(
+        values=values,
+        weights=weights,
+        cells=cells,
+        within=within.double().numpy(),
+        order=np.argsort(cells, axis=None, kind="stable"),
+        first=np.append(0, np.bincount(cells.ravel()).cumsum()),
+    )
 
 
 def _left(ratios: _Ratios, weights: Array, basis: _Basis, solution: Array) -> Array:
@@ -324,16 +342,19 @@ class _Channel:
         In parts of their mean weighted square.
         """
         splines, (cores, _) = self.basis.splines, self._columns()
-        misfit = self._over_cells(self.weights * left, cores)
-        means = sparse.diags(1 / self._mass()) @ (self._over_cells(self.weights, cores) @ splines)
-        of_cores = sparse.diags(np.asarray(misfit.sum(axis=0)).ravel()) @ splines - misfit.T @ means
-        of_cells = misfit @ splines - sparse.diags(np.asarray(misfit.sum(axis=1)).ravel()) @ means
-        power = float((self.weights.sum(axis=0) @ splines.multiply(splines)).sum())
-        power -= float((self._mass() @ means.multiply(means)).sum())
+        dense, mass, missed = splines.toarray(), self._mass(), self.weights * left
+        weights, misfit = (self.ratios.over_cells(part, cores) for part in (self.weights, missed))
+        in_cells = self._sum_over_cells(missed)
+        of_cores = missed.sum(axis=0)[:, None] * dense
+        power, by_cell = float((self.weights.sum(axis=0) @ splines.multiply(splines)).sum()), 0.0
+        for rows in _blocks(len(mass)):
+            means = (weights[rows] @ dense) / mass[rows, None]
+            of_cores -= misfit[rows].T @ means
+            by_cell += float(np.square(misfit[rows] @ dense - in_cells[rows, None] * means).sum())
+            power -= float((mass[rows] @ means**2).sum())
         square = float((self.weights * left**2).sum()) / max(int((self.weights > 0).sum()), 1)
-        by_core, by_cell = (float(part.multiply(part).sum()) for part in (of_cores, of_cells))
         expected = max(square * power, 1e-30)
-        return by_core / expected, by_cell / expected
+        return float(np.square(of_cores).sum()) / expected, by_cell / expected
 
     def _of_regressors(self) -> tuple[Array, Array]:
         """Return matrix and right-hand side in control points, slopes within cells (2) and log exposures."""
@@ -342,14 +363,17 @@ class _Channel:
         moments, light = w[..., None] * within, w * self.values
         first, last = slice(splines.shape[1]), slice(splines.shape[1] + 2, None)
         middle = slice(first.stop, last.start)
-        in_cells = sparse.hstack(
-            [self._over_cells(w, cores) @ splines]
-            + [self._sum_over_cells(part)[:, None] for part in np.moveaxis(moments, -1, 0)]
-            + [self._over_cells(w, times)],
-            format="csr",
-        )
-        inverse = sparse.diags(1 / self._mass())
-        matrix = -(in_cells.T @ inverse @ in_cells).toarray()
+        dense, scale = splines.toarray(), 1 / np.sqrt(self._mass())
+        of_cores, of_times = (self.ratios.over_cells(w, columns) for columns in (cores, times))
+        of_slopes = np.stack([self._sum_over_cells(part) for part in np.moveaxis(moments, -1, 0)], axis=1)
+        of_light = self._sum_over_cells(light)
+        size = dense.shape[1] + 2 + len(w)
+        matrix, rhs = np.zeros((size, size)), np.zeros(size)
+        for cells in _blocks(len(scale)):
+            own = np.hstack([of_cores[cells] @ dense, of_slopes[cells], of_times[cells].toarray()])
+            own *= scale[cells, None]
+            matrix -= own.T @ own
+            rhs -= own.T @ (scale * of_light)[cells]
         for rows, columns, part in (
             (first, first, (splines.T @ sparse.diags(w.sum(axis=0)) @ splines).toarray()),
             (first, middle, splines.T @ moments.sum(axis=0)),
@@ -361,24 +385,24 @@ class _Channel:
             matrix[rows, columns] += part
             if rows != columns:
                 matrix[columns, rows] += part.T
-        rhs = [splines.T @ light.sum(axis=0), np.einsum("tni,tn->i", within, light), light.sum(axis=1)]
-        return matrix, np.concatenate(rhs) - in_cells.T @ (inverse @ self._sum_over_cells(light))
+        whole = [splines.T @ light.sum(axis=0), np.einsum("tni,tn->i", within, light), light.sum(axis=1)]
+        return matrix, rhs + np.concatenate(whole)
 
     def _columns(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the number of the core, and of the frame, of each sample, (T * N,)."""
         frames, count = self.values.shape
         return np.tile(np.arange(count), frames), np.repeat(np.arange(frames), count)
 
-    def _over_cells(self, values: Array, columns: NDArray[np.intp]) -> Any:
-        """Return the sparse sums of values (T, N) over cells (rows) and something else."""
-        entries = (values.ravel(), (self.ratios.cells.ravel(), columns))
-        return sparse.csr_matrix(entries, shape=(len(self._mass()), int(columns.max()) + 1))
-
     def _sum_over_cells(self, values: Array) -> Array:
         return np.bincount(self.ratios.cells.ravel(), values.ravel()).astype(np.float64)
 
     def _mass(self) -> Array:
         return np.maximum(self._sum_over_cells(self.weights), 1e-12)
+
+
+def _blocks(count: int) -> list[slice]:
+    """Return the rows of cells that are taken at once."""
+    return [slice(first, first + _CELLS_AT_ONCE) for first in range(0, count, _CELLS_AT_ONCE)]
 
 
 def _channels(ratios: _Ratios, weights: Array, basis: _Basis) -> list[_Channel]:
@@ -404,7 +428,7 @@ def _normal_equations(channels: list[_Channel], left: Array) -> _System:
         matrix[np.ix_(at, at)] += own
         rhs[at] += own_rhs
         counted = channel.weights > 0
-        free += int(counted.sum()) - len(np.unique(channel.ratios.cells[counted]))
+        free += int(counted.sum()) - int(np.count_nonzero(np.bincount(channel.ratios.cells[counted])))
         squares += float((channel.weights * left[..., number] ** 2).sum())
     return _System(matrix=matrix, rhs=rhs).of_noise(max(squares / max(free, 1), 1e-12))
 
