@@ -136,6 +136,7 @@ class Stages:
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = in_grey(self._frames)
         self._marks = find_marks(self._grey[exposed(self._grey)])
+        self._taken: tuple[Bundle, dict[int, Samples]] | None = None
 
     def align(self) -> Generator[Fitted | None, None, Fitted]:
         """Calibrate and register; None until the bundle is known."""
@@ -159,10 +160,11 @@ class Stages:
         if mount is not None:
             self._frames = mount.steadied(torch.from_numpy(self._burst.frames).to(self._frames))
             self._grey = in_grey(self._frames)
+            self._taken = None
             steadied = (_warned(mount.note),)
         yield None
         bundle, notes = yield from self._calibrate(mount)
-        samples = _seen(sample_cores(self._grey[..., None], bundle, self._burst), mount)
+        samples = _seen(self._cores(bundle, self._grey[..., None]), mount)
         fitted = Fitted(
             bundle=bundle,
             registration=unregistered(samples),
@@ -207,7 +209,7 @@ class Stages:
         """Make bundle, samples, motion and image belong together, wherever the steps have ended."""
         if fitted is None:
             bundle = plain_frames(self._burst.shape[1:3], self._burst)
-            samples = sample_cores(self._grey[..., None], bundle, self._burst)
+            samples = self._cores(bundle, self._grey[..., None])
             text = "the run ended before the bundle was calibrated"
             fitted = Fitted(
                 bundle=bundle,
@@ -282,7 +284,7 @@ class Stages:
     def _from_equal_gains(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Register once more from equal gains, and keep that start whose samples predict one another better."""
         bundle = with_even_gains(fitted.bundle)
-        samples = _seen(sample_cores(self._grey[..., None], bundle, self._burst), fitted.mount)
+        samples = _seen(self._cores(bundle, self._grey[..., None]), fitted.mount)
         again = replace(fitted, bundle=bundle, registration=unregistered(samples), scene=None, image=None)
         steps = self._register(again, samples)
         while True:
@@ -295,7 +297,7 @@ class Stages:
 
     def _error(self, fitted: Fitted) -> float:
         """Return by how much samples that are left out are missed, relative to their mean light."""
-        samples = _seen(sample_cores(self._grey[..., None], fitted.bundle, self._burst), fitted.mount)
+        samples = _seen(self._cores(fitted.bundle, self._grey[..., None]), fitted.mount)
         grid = self._grid(max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch), fitted)
         return prediction_error(samples, fitted.registration, grid, seed=self._seed)
 
@@ -311,7 +313,7 @@ class Stages:
         """Take the slow changes of the mean frame into a bundle of unknown gains, where that is asked for."""
         if self._method.flatten != "frame" or bundle.gains_known:
             return bundle
-        return lit(bundle, shading_of_frames(sample_cores(self._frames, bundle, self._burst)))
+        return lit(bundle, shading_of_frames(self._cores(bundle, self._frames)))
 
     def _without_offsets(self, fitted: Fitted) -> Fitted:
         """Take the light that cores show by themselves into the bundle, and out of the samples."""
@@ -329,7 +331,7 @@ class Stages:
         samples, registration = fitted.samples, fitted.registration
         cores = samples
         if samples.kind != "cores":
-            cores = _seen(sample_cores(self._frames, fitted.bundle, self._burst), fitted.mount)
+            cores = _seen(self._cores(fitted.bundle, self._frames), fitted.mount)
         shading = find_shading(cores, registration)
         if shading is None:
             return fitted
@@ -344,8 +346,11 @@ class Stages:
         """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
         outliers = self._outliers(fitted)
         bundle, registration = remeasured(fitted.bundle, fitted.registration, self._grey, self._burst)
-        observe = sample_pixels if self._kind(bundle, registration) == "pixels" else sample_cores
-        samples = _seen(observe(self._frames, bundle, self._burst), fitted.mount)
+        if self._kind(bundle, registration) == "pixels":
+            samples = sample_pixels(self._frames, bundle, self._burst)
+        else:
+            samples = self._cores(bundle, self._frames)
+        samples = _seen(samples, fitted.mount)
         if outliers is not None:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples, outliers=outliers)
@@ -385,7 +390,7 @@ class Stages:
         registration, scene = fitted.registration, fitted.registration.scene
         if registration.is_still or scene is None:
             return None
-        samples = _seen(sample_cores(self._grey[..., None], fitted.bundle, self._burst), fitted.mount)
+        samples = _seen(self._cores(fitted.bundle, self._grey[..., None]), fitted.mount)
         points = registration.motion.apply(samples.positions)
         outliers = find_outliers(registration.correct(samples), points, scene.grid, scene.light * scene.nodes[None])
         return outliers if bool(outliers.any()) else None
@@ -398,14 +403,23 @@ class Stages:
             return "pixels"
         if registration.is_still:
             return "cores"
-        cores = sample_cores(self._grey[..., None], bundle, self._burst).weighted(torch.from_numpy(registration.used))
+        cores = self._cores(bundle, self._grey[..., None]).weighted(torch.from_numpy(registration.used))
         return "pixels" if shows_detail(self._grey, bundle, self._burst, cores, registration.predicted) else "cores"
+
+    def _cores(self, bundle: Bundle, frames: Tensor) -> Samples:
+        """Return the samples of whole cores of all frames, in colour or grey; those of the last bundle are kept."""
+        if self._taken is None or self._taken[0] is not bundle:
+            self._taken = bundle, {}
+        kept, channels = self._taken[1], frames.shape[-1]
+        if channels not in kept:
+            kept[channels] = sample_cores(frames, bundle, self._burst)
+        return kept[channels]
 
     def _in_colour(self, fitted: Fitted) -> Samples:
         """Return the final samples; before they are known, those of whole cores."""
         if fitted.samples is not None:
             return fitted.samples
-        return _seen(sample_cores(self._frames, fitted.bundle, self._burst), fitted.mount)
+        return _seen(self._cores(fitted.bundle, self._frames), fitted.mount)
 
     def _sketched(self, fitted: Fitted) -> Fitted:
         """Solve a coarse image of all that is known so far."""
