@@ -171,9 +171,10 @@ class Stages:
             canvas=self._frame_canvas(),
             mount=mount,
             notes=(*steadied, *notes),
-            noise=self._noise(bundle, samples, mount),
         )
+        fitted = self._glimpsed(fitted, samples)
         yield fitted
+        fitted = replace(fitted, noise=self._noise(bundle, samples, mount))
         fitted = yield from self._register(fitted, samples)
         return (yield from self._from_equal_gains(fitted)) if self._is_start_in_doubt(fitted) else fitted
 
@@ -421,13 +422,28 @@ class Stages:
             return fitted.samples
         return _seen(self._cores(fitted.bundle, self._frames), fitted.mount)
 
+    def _glimpsed(self, fitted: Fitted, samples: Samples) -> Fitted:
+        """Fill the gaps between the cores of the first frame that shows something.
+
+        Before the frames are registered to a part of a pitch, all of them together show less than one of them does.
+        """
+        number = int(np.argmax((samples.weights > 0).any(dim=1).cpu().numpy()))
+        chosen = slice(number, number + 1)
+        shown = sample_cores(self._frames[chosen], fitted.bundle, self._burst)
+        shown = replace(shown, weights=samples.weights[chosen])
+        grid = self._grid(self._spacing(fitted.bundle), fitted)
+        return self._with_scene(fitted, solve_quickly(shown, unregistered(shown), grid, self._method.smoothness))
+
     def _sketched(self, fitted: Fitted) -> Fitted:
         """Solve a coarse image of all that is known so far."""
         samples = self._in_colour(fitted)
         fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
-        spacing = max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
-        scene = solve_quickly(samples, fitted.registration, self._grid(spacing, fitted), self._method.smoothness)
-        return self._with_scene(fitted, scene)
+        grid = self._grid(self._spacing(fitted.bundle), fitted)
+        return self._with_scene(fitted, solve_quickly(samples, fitted.registration, grid, self._method.smoothness))
+
+    def _spacing(self, bundle: Bundle) -> float:
+        """Return the spacing of a preview's nodes, pixels."""
+        return max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * bundle.pitch)
 
     def _with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
         """Return what is known with another scene, and the image that it stands for."""
