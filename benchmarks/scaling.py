@@ -1,6 +1,6 @@
 """How time and memory of a reconstruction grow with frames and with pixels, as curves with their slopes.
 
-    python -m benchmarks.scaling --results benchmarks/results/scaling
+    python -m benchmarks.scaling
     python -m benchmarks.scaling --frames 10 30 100 --megapixels 0.1 0.4 --publish docs
 
 Each fit is in a process of its own. A slope is that of a straight line through the logarithms: 1 is linear. The longest
@@ -8,7 +8,6 @@ bursts take an hour on two cores; --most-minutes stops a curve before its next p
 """
 
 import argparse
-import json
 import math
 import sys
 import tempfile
@@ -38,7 +37,7 @@ def main() -> int:
     parser.add_argument("--frames", type=int, nargs="*", default=FRAMES, help=f"of {_SIDE} x {_SIDE} pixels")
     parser.add_argument("--megapixels", type=float, nargs="*", default=MEGAPIXELS, help=f"of {_FRAMES} frames")
     parser.add_argument("--most-minutes", type=float, default=60.0, help="for one fit, default 60")
-    parser.add_argument("--publish", type=Path, help="folder to write scaling.json and scaling.webp to")
+    parser.add_argument("--publish", type=Path, help="folder to write scaling_table.md and scaling.webp to")
     options = parser.parse_args()
     try:
         curves = {
@@ -55,7 +54,7 @@ def main() -> int:
         if len(points) > 1:
             print(f"against {name}: time grows with the power {slope(points, 'seconds'):.2f}", flush=True)
     if options.publish is not None:
-        (options.publish / "scaling.json").write_text(json.dumps(curves, indent=1) + "\n", encoding="utf-8")
+        (options.publish / "scaling_table.md").write_text(in_markdown(curves), encoding="utf-8")
         draw(curves, options.publish / "scaling.webp")
     return 0
 
@@ -80,6 +79,16 @@ def slope(points: Sequence[dict[str, float]], of: str) -> float:
     """Return the slope of a straight line through the logarithms, over the upper half of the points."""
     upper = points[len(points) // 2 - (len(points) < 4) :]
     return float(np.polyfit(np.log([point["at"] for point in upper]), np.log([point[of] for point in upper]), 1)[0])
+
+
+def in_markdown(curves: dict[str, list[dict[str, float]]]) -> str:
+    """Return a table of all points."""
+    rows = [
+        f"| {point['frames']} x {point['side']} x {point['side']} | {point['seconds']:.1f} s | {point['memory']:.1f} |"
+        for points in curves.values()
+        for point in points
+    ]
+    return "\n".join(["| burst | time | memory, times the frames |", "| --- | --- | --- |", *rows]) + "\n"
 
 
 def draw(curves: dict[str, list[dict[str, float]]], path: Path) -> None:

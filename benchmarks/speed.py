@@ -1,7 +1,7 @@
 """How long a reconstruction takes beside an earlier version of the package: what a user waits for, burst by burst.
 
     python -m benchmarks.speed
-    python -m benchmarks.speed --burst FOLDER --long --traffic --publish docs/speed.json
+    python -m benchmarks.speed --burst FOLDER --long --traffic --publish docs
 
 Both versions fit the same bursts in turn, each in a fresh process, because machines are shared and noisy; the time is
 the least of the repeats, imports left out. The earlier version is taken from the repository's history into a folder of
@@ -37,6 +37,7 @@ from napari_fiberburst.simulation import Camera, Faults, simulate
 
 REFERENCE = "7aa3279"
 PUBLISHED = HERE / "docs" / "speed.json"
+TABLE = "speed_table.md"
 MOST_SLOWER = 1.15
 _COPIED = 25_000_000  # numbers, of the copy that measures the memory
 
@@ -133,13 +134,22 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if options.publish is not None:
-        known = {**read(options.publish), **{row.name: asdict(row) for row in rows}}
-        options.publish.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        publish(rows, options.publish)
         return 0
     slower = [row.name for row in rows if is_slower(row, published)]
     if slower:
         print(f"slower than published by more than {100 * (MOST_SLOWER - 1):.0f} %: {', '.join(slower)}")
     return 1 if slower else 0
+
+
+def publish(rows: Sequence[Row], folder: Path) -> None:
+    """Write the table for the documentation and its figures; rows that were not measured anew stay."""
+    path = folder / PUBLISHED.name
+    known = {**read(path), **{row.name: asdict(row) for row in rows}}
+    path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+    lines = [line(Row(**row), known) for row in known.values()]
+    text = "\n".join([header(is_bound_shown=True), *lines])
+    (folder / TABLE).write_text(text + "\n", encoding="utf-8")
 
 
 @contextmanager
@@ -233,7 +243,7 @@ def is_slower(row: Row, published: dict[str, dict[str, float]]) -> bool:
 
 def header(*, is_bound_shown: bool) -> str:
     """Return the table's head, in Markdown."""
-    names = ["burst", "before", "now", "time x", "published x", "goal x", "memory, x frames"]
+    names = ["burst", "before", "now", "time x", "published x", "goal x", "memory x"]
     names += ["by memory alone"] if is_bound_shown else []
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, ["---"] * len(names)))
 

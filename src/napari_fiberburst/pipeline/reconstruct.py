@@ -69,7 +69,7 @@ def reconstruct(
     device : str, optional
         "auto", "cpu", "cuda", "cuda:1", "mps".
     seed : int
-        The same seed gives the same bits on the same CPU with the same number of threads.
+        The same seed gives the same bits on the same CPU, whatever the number of threads; a network's depend on it.
     bundle : Bundle, array_like or path, optional
         The bundle, where it is known: a `Bundle`, a file that one was saved to, or an image of the bundle with nothing
         but even light before it. It is never needed, but where it is given, one frame is a burst. It may sit up to 5

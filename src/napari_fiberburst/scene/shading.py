@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import sparse
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
@@ -117,11 +118,13 @@ def find_shading(samples: Samples, registration: Registration) -> Shading | None
         gains=torch.ones(samples.cores, samples.values.shape[2]).to(samples.values),
         exposures=torch.ones(len(samples.values)).to(samples.values),
     )
-    for _ in range(_ROUNDS):
-        left = _find_what_is_left(samples.without_gains(found.gains), found.exposed(registration))
-        if left is None:
-            break
-        found = found.times(left)
+    # By one thread, because BLAS rounds its products differently by each number of threads.
+    with threadpool_limits(limits=1, user_api="blas"):
+        for _ in range(_ROUNDS):
+            left = _find_what_is_left(samples.without_gains(found.gains), found.exposed(registration))
+            if left is None:
+                break
+            found = found.times(left)
     return found if found.is_noticeable else None
 
 
