@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.burst import Burst
-from napari_fiberburst.device import find_device
+from napari_fiberburst.device import find_device, settle_threads
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.pipeline.network import NetworkFit, published
@@ -217,6 +217,7 @@ def iterate(
     if isinstance(settings.method, SplineMethod) and initial is not None:
         raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
     device = find_device(settings.device)
+    settle_threads()
     fit: Fit
     match settings.method:
         case SplineMethod() as method:
