@@ -41,6 +41,7 @@ def main() -> None:
     if task == "kept":
         more["bundle"] = reconstruct(burst, **more).bundle
     elif task == "first picture":
+        more["preview_every"] = 1e-6
         more["on_progress"] = lambda report: previews.extend([time.perf_counter()] * (report.preview is not None))
         more["should_stop"] = lambda: bool(previews)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
