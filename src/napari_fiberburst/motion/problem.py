@@ -26,8 +26,6 @@ class Level:
         Weight of the membrane prior on the change of the scene.
     iterations : int
         At most.
-    products : int
-        Iterations of conjugate gradients in each of them, at most.
     dof : int
         Generators that move, at most.
     bends : bool
@@ -40,7 +38,6 @@ class Level:
     spacing: float
     smoothness: float
     iterations: int
-    products: int = 12
     dof: int = 8
     bends: bool = False
     damping: float = LEAST_DAMPING
@@ -55,16 +52,9 @@ FINER = (
     Level(spacing=0.7, smoothness=1.0, iterations=6, damping=0.1, decay=0.5),
     Level(spacing=0.4, smoothness=0.3, iterations=5),
 )
-# And to some hundredths of a pixel, with the samples' own footprint in the model. Half of the products find motion as
-# well, but not what scene and gains share: a slope of the gains would then be taken for a shading of the light.
-FINE_CORES = (
-    Level(spacing=0.3, smoothness=0.1, iterations=3, products=24),
-    Level(spacing=0.22, smoothness=0.03, iterations=2, products=24),
-)
-FINE_PIXELS = (
-    Level(spacing=0.25, smoothness=0.1, iterations=2, products=24),
-    Level(spacing=0.18, smoothness=0.03, iterations=2, products=24),
-)
+# And to some hundredths of a pixel, with the samples' own footprint in the model.
+FINE_CORES = (Level(spacing=0.3, smoothness=0.1, iterations=3), Level(spacing=0.22, smoothness=0.03, iterations=2))
+FINE_PIXELS = (Level(spacing=0.25, smoothness=0.1, iterations=2), Level(spacing=0.18, smoothness=0.03, iterations=2))
 # Frames that bend, once their homographies are known. The scene is coarse at first: that reaches farther, and a fine
 # one would take up what the displacement still misses, so that the residuals told nothing of it. With scenes of 0.6
 # pitch at first, displacements of 6 pixels (root mean square) are missed by 3 pixels instead of 0.5.
