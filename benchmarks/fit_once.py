@@ -4,9 +4,9 @@
 
 Of napari_fiberburst it imports what all versions have. In: `frames` (T, H, W, C) as recorded, `black_level` and
 `white_level`, `scale`, image pixels to a frame pixel, and `device`; `task`, if it is not "fit": "kept", for a bundle
-that is known from an earlier fit of the same burst, or "first picture", which ends with the first preview. Out:
-`image`, frame 0's field, `seconds` without imports and reading, `peak`, by how many bytes the fit has raised the most
-memory that the process has had, and `package`, the folder of the package that made it.
+that is known from an earlier fit of the same burst, in versions that keep bundles, or "first picture", which ends with
+the first preview. Out: `image`, frame 0's field, `seconds` without imports and reading, `peak`, by how many bytes the
+fit has raised the most memory that the process has had, and `package`, the folder of the package that made it.
 """
 
 import resource
@@ -39,7 +39,8 @@ def main() -> None:
     more: dict[str, Any] = {"device": str(inputs["device"]), "fill": True}
     previews: list[float] = []
     if task == "kept":
-        more["bundle"] = reconstruct(burst, **more).bundle
+        known = getattr(reconstruct(burst, **more), "bundle", None)
+        more |= {} if known is None else {"bundle": known}
     elif task == "first picture":
         more["preview_every"] = 1e-6
         more["on_progress"] = lambda report: previews.extend([time.perf_counter()] * (report.preview is not None))

@@ -25,8 +25,8 @@ _EXPOSURE_VARIANCE = 0.01
 _CURVATURE, _RIDGE = 1.8, 1e-3
 # Of conjugate gradients: iterations at most, and the relative error at which they end. A Gauss-Newton step is only
 # right to first order, so solving it further gains nothing; displacements go through more levels instead. Motion is as
-# right after half as many iterations, but what scene and gains share is not: a slope of the gains would then be taken for
-# a shading of the light.
+# right after half as many iterations, but what scene and gains share is not: a slope of the gains would be taken for a
+# shading of the light, and frames of a coarse bundle seem to bend.
 _ITERATIONS, _BENDING_ITERATIONS, _TOLERANCE = 24, 12, 1e-2
 
 
