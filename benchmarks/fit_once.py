@@ -20,9 +20,6 @@ import numpy as np
 import napari_fiberburst
 from napari_fiberburst import Burst, reconstruct
 
-# Bytes to a unit of ru_maxrss.
-_UNIT = 1 if sys.platform == "darwin" else 1024
-
 
 def main() -> None:
     """Read, reconstruct, write."""
@@ -45,14 +42,22 @@ def main() -> None:
         more["preview_every"] = 1e-6
         more["on_progress"] = lambda report: previews.extend([time.perf_counter()] * (report.preview is not None))
         more["should_stop"] = lambda: bool(previews)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = most_memory()
     start = time.perf_counter()
     result = reconstruct(burst, **more)
     image = result.image if inputs["scale"] == 1 else result.render(scale=float(inputs["scale"]))
     seconds = (previews[0] if previews else time.perf_counter()) - start
-    peak = _UNIT * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    peak = most_memory() - before
     package = str(Path(napari_fiberburst.__file__).parent)
     np.savez(target, image=image, seconds=seconds, peak=peak, package=package)
+
+
+def most_memory() -> int:
+    """Return the most memory that this process has had, bytes."""
+    status = Path("/proc/self/status")
+    if status.exists():  # Linux's ru_maxrss begins with that of the process that has started this one
+        return 1024 * int(status.read_text().split("VmHWM:")[1].split()[0])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 if __name__ == "__main__":
