@@ -39,11 +39,12 @@ bench: .venv/bench .venv-peers/made
 bench-quick: .venv/bench
 	$(BIN)/python -m benchmarks --quick --results benchmarks/results-quick --overwrite $(MORE)
 
-# What a change of the code may cost: a step, memory, startup.
-bench-code: .venv/base
+# What a change of the code may cost: a step, memory, startup, and whole fits beside an earlier version's.
+bench-code: .venv/bench
 	$(BIN)/python benchmarks/step.py
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/startup.py
+	$(BIN)/python -m benchmarks.speed
 
 # PyFibreBundle, away from napari: its OpenCV brings another Qt.
 peers: .venv-peers/made
