@@ -143,9 +143,12 @@ def main() -> int:
 
 
 def publish(rows: Sequence[Row], folder: Path) -> None:
-    """Write the table for the documentation and its figures; rows that were not measured anew stay."""
+    """Write the table for the documentation and its figures; what was not measured anew stays."""
     path = folder / PUBLISHED.name
-    known = {**read(path), **{row.name: asdict(row) for row in rows}}
+    known = read(path)
+    for row in rows:
+        measured = {key: value for key, value in asdict(row).items() if value is not None}
+        known[row.name] = {**known.get(row.name, {}), **measured}
     path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
     lines = [line(Row(**row), known) for row in known.values()]
     text = "\n".join([header(is_bound_shown=True), *lines])
@@ -229,13 +232,13 @@ def memory_bandwidth() -> float:
     return 2 * source.numel() * source.element_size() / min(times)
 
 
-def read(path: Path) -> dict[str, dict[str, float]]:
+def read(path: Path) -> dict[str, dict[str, Any]]:
     """Return published rows by name; none where nothing has been published."""
-    known: dict[str, dict[str, float]] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    known: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     return known
 
 
-def is_slower(row: Row, published: dict[str, dict[str, float]]) -> bool:
+def is_slower(row: Row, published: dict[str, dict[str, Any]]) -> bool:
     """Tell whether a row's ratio is well above the published one."""
     earlier = published.get(row.name)
     return earlier is not None and row.ratio > MOST_SLOWER * earlier["after"] / earlier["before"]
@@ -248,7 +251,7 @@ def header(*, is_bound_shown: bool) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, ["---"] * len(names)))
 
 
-def line(row: Row, published: dict[str, dict[str, float]]) -> str:
+def line(row: Row, published: dict[str, dict[str, Any]]) -> str:
     """Return a row of the table, in Markdown."""
     earlier = published.get(row.name)
     known = "-" if earlier is None else f"{earlier['after'] / earlier['before']:.2f}"
