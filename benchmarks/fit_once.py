@@ -35,12 +35,17 @@ def main() -> None:
     )
     more: dict[str, Any] = {"device": str(inputs["device"]), "fill": True}
     previews: list[float] = []
+
+    def note(report: Any) -> None:
+        if report.preview is not None:
+            previews.append(time.perf_counter())
+
     if task == "kept":
         known = getattr(reconstruct(burst, **more), "bundle", None)
         more |= {} if known is None else {"bundle": known}
     elif task == "first picture":
         more["preview_every"] = 1e-6
-        more["on_progress"] = lambda report: previews.extend([time.perf_counter()] * (report.preview is not None))
+        more["on_progress"] = note
         more["should_stop"] = lambda: bool(previews)
     before = most_memory()
     start = time.perf_counter()

@@ -13,13 +13,12 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 
-from benchmarks.side_by_side import HERE, fitted
+from benchmarks.side_by_side import HERE, fitted, inputs_of
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.simulation import Camera, simulate
 
@@ -52,7 +51,7 @@ def main() -> int:
         return 2
     for name, points in curves.items():
         if len(points) > 1:
-            print(f"against {name}: time grows with the power {slope(points, 'seconds'):.2f}", flush=True)
+            print(f"against {name}: time grows with the power {slope(points):.2f}", flush=True)
     if options.publish is not None:
         (options.publish / "scaling_table.md").write_text(in_markdown(curves), encoding="utf-8")
         draw(curves, options.publish / "scaling.webp")
@@ -75,10 +74,11 @@ def curve(sizes: Sequence[tuple[int, int, float]], most_minutes: float) -> list[
     return points
 
 
-def slope(points: Sequence[dict[str, float]], of: str) -> float:
-    """Return the slope of a straight line through the logarithms, over the upper half of the points."""
-    upper = points[len(points) // 2 - (len(points) < 4) :]
-    return float(np.polyfit(np.log([point["at"] for point in upper]), np.log([point[of] for point in upper]), 1)[0])
+def slope(points: Sequence[dict[str, float]]) -> float:
+    """Return the power with which time grows: the slope of a straight line through the upper half of the points."""
+    upper = points[(len(points) - 1) // 2 :]
+    at, seconds = ([point[of] for point in upper] for of in ("at", "seconds"))
+    return float(np.polyfit(np.log(at), np.log(seconds), 1)[0])
 
 
 def in_markdown(curves: dict[str, list[dict[str, float]]]) -> str:
@@ -120,14 +120,13 @@ def _fit(frames: int, side: int) -> dict[str, float]:
         pitch=_PITCH,
         camera=Camera(photons=10_000.0),
     )
-    levels: dict[str, Any] = {"black_level": made.burst.black_level, "white_level": made.burst.white_level}
-    shown = made.arrays()["frames"]
+    inputs = inputs_of(made, "cpu")
     del made
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder, "burst.npz")
-        np.savez(source, frames=shown, **levels, scale=1, device="cpu")
+        np.savez(source, **inputs)
         fit = fitted(HERE, source)
-    return {"frames": frames, "side": side, "seconds": fit.seconds, "memory": fit.peak / (4 * shown.size)}
+    return {"frames": frames, "side": side, "seconds": fit.seconds, "memory": fit.peak / (4 * inputs["frames"].size)}
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from benchmarks.real import FIELD, SCALE, RealBurst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import FiberBurstError, SettingsError
 from napari_fiberburst.quality import psnr
+from napari_fiberburst.simulation import SimulatedBurst
 
 HERE = Path(__file__).parents[1]
 FINEST_GROUP = 7
@@ -168,14 +169,18 @@ def trials(chosen: dict[str, Case], real: RealBurst | None, device: str) -> Iter
 def simulated(name: str, case: Case, device: str) -> Trial:
     """Return a simulated burst, judged by its truth."""
     made = case.make()
-    levels = {"black_level": made.burst.black_level, "white_level": made.burst.white_level}
-    inputs = {"frames": made.arrays()["frames"], **levels, "scale": 1, "device": device}
     visible = np.ones(made.truth.shape[1:3], bool) if made.visible is None else made.visible
 
     def quality(image: NDArray[np.float32]) -> float:
         return psnr(as_channels(image)[visible][None], made.truth[0][visible][None])
 
-    return Trial(name=name, inputs=inputs, quality=quality)
+    return Trial(name=name, inputs=inputs_of(made, device), quality=quality)
+
+
+def inputs_of(made: SimulatedBurst, device: str) -> dict[str, Any]:
+    """Return a simulated burst as `benchmarks/fit_once.py` reads it."""
+    levels = {"black_level": made.burst.black_level, "white_level": made.burst.white_level}
+    return {"frames": made.arrays()["frames"], **levels, "scale": 1, "device": device}
 
 
 def recorded(real: RealBurst) -> Trial:
@@ -186,9 +191,13 @@ def recorded(real: RealBurst) -> Trial:
         finest = [float(row["modulation"]) for row in elements if row["group"] == FINEST_GROUP]
         return 20 * math.log10(max(statistics.mean(finest), 1e-6))
 
+    return Trial(name="real burst, modulation", inputs=inputs_of_real(real, SCALE), quality=quality)
+
+
+def inputs_of_real(real: RealBurst, scale: int) -> dict[str, Any]:
+    """Return the real burst as `benchmarks/fit_once.py` reads it."""
     levels = {"black_level": 0, "white_level": np.iinfo(real.frames.dtype).max}
-    inputs = {"frames": real.frames[..., None], **levels, "scale": SCALE, "device": real.device}
-    return Trial(name="real burst, modulation", inputs=inputs, quality=quality)
+    return {"frames": real.frames[..., None], **levels, "scale": scale, "device": real.device}
 
 
 def as_channels(image: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -30,7 +30,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from benchmarks.real import RealBurst
-from benchmarks.side_by_side import HERE, fitted
+from benchmarks.side_by_side import HERE, fitted, inputs_of, inputs_of_real
 from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.errors import FiberBurstError, SettingsError
 from napari_fiberburst.simulation import Camera, Faults, simulate
@@ -111,7 +111,7 @@ def main() -> int:
     parser.add_argument("--traffic", action="store_true", help="add what the memory's bandwidth would allow")
     parser.add_argument("--repeats", type=int, default=2, help="fits by each version, default 2")
     parser.add_argument(
-        "--publish", type=Path, help="write the figures to this file, JSON, for later runs to be held to"
+        "--publish", type=Path, help="folder for the table, and for its figures, which later runs are held to"
     )
     options = parser.parse_args()
     chosen = [*ROWS, *([LONG] if options.long else []), *([] if options.burst is None else [REAL])]
@@ -124,12 +124,12 @@ def main() -> int:
             raise SettingsError(f"--rows must name parts of {', '.join(row.name for row in ROWS)}; got {options.rows}")
         published = read(PUBLISHED)
         bandwidth = memory_bandwidth() if options.traffic else None
-        print(header(is_bound_shown=options.traffic), flush=True)
+        print(header("published x"), flush=True)
         rows = []
         with checked_out(options.reference) as other:
             for timed in chosen:
                 rows.append(measure(timed, other, options.repeats, bandwidth, options.burst))
-                print(line(rows[-1], published), flush=True)
+                print(line(rows[-1], _ratio_published(rows[-1], published)), flush=True)
     except FiberBurstError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -150,9 +150,8 @@ def publish(rows: Sequence[Row], folder: Path) -> None:
         measured = {key: value for key, value in asdict(row).items() if value is not None}
         known[row.name] = {**known.get(row.name, {}), **measured}
     path.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
-    lines = [line(Row(**row), known) for row in known.values()]
-    text = "\n".join([header(is_bound_shown=True), *lines])
-    (folder / TABLE).write_text(text + "\n", encoding="utf-8")
+    lines = [header(), *(line(Row(**row)) for row in known.values())]
+    (folder / TABLE).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 @contextmanager
@@ -241,34 +240,32 @@ def read(path: Path) -> dict[str, dict[str, Any]]:
 def is_slower(row: Row, published: dict[str, dict[str, Any]]) -> bool:
     """Tell whether a row's ratio is well above the published one."""
     earlier = published.get(row.name)
-    return earlier is not None and row.ratio > MOST_SLOWER * earlier["after"] / earlier["before"]
+    return earlier is not None and row.ratio > MOST_SLOWER * Row(**earlier).ratio
 
 
-def header(*, is_bound_shown: bool) -> str:
-    """Return the table's head, in Markdown."""
-    names = ["burst", "before", "now", "time x", "published x", "goal x", "memory x"]
-    names += ["by memory alone"] if is_bound_shown else []
+def header(*more: str) -> str:
+    """Return the table's head, in Markdown, with more columns if any are named."""
+    names = ["burst", "before", "now", "time x", "goal x", "memory x", "by memory alone", *more]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, ["---"] * len(names)))
 
 
-def line(row: Row, published: dict[str, dict[str, Any]]) -> str:
+def line(row: Row, *more: str) -> str:
     """Return a row of the table, in Markdown."""
+    bound = "" if row.traffic is None else f"{row.traffic:.2f} s"
+    times = [f"{row.before:.2f} s", f"{row.after:.2f} s", f"{row.ratio:.2f}", f"{row.goal:.2f}"]
+    return "| " + " | ".join([row.name, *times, f"{row.memory:.1f}", bound, *more]) + " |"
+
+
+def _ratio_published(row: Row, published: dict[str, dict[str, Any]]) -> str:
     earlier = published.get(row.name)
-    known = "-" if earlier is None else f"{earlier['after'] / earlier['before']:.2f}"
-    cells = [row.name, f"{row.before:.2f} s", f"{row.after:.2f} s", f"{row.ratio:.2f}", known, f"{row.goal:.2f}"]
-    cells += [f"{row.memory:.1f}"]
-    cells += [] if row.traffic is None else [f"{row.traffic:.2f} s"]
-    return "| " + " | ".join(cells) + " |"
+    return "-" if earlier is None else f"{Row(**earlier).ratio:.2f}"
 
 
 def _inputs(timed: Timed, folder: Path | None) -> dict[str, Any]:
-    if not timed.recipe:
-        assert folder is not None
-        frames = RealBurst.read(folder, "cpu").frames[..., None]
-        return {"frames": frames, "black_level": 0, "white_level": 255, "scale": 1, "device": "cpu"}
-    made = simulate(**timed.recipe)
-    levels = {"black_level": made.burst.black_level, "white_level": made.burst.white_level}
-    return {"frames": made.arrays()["frames"], **levels, "scale": 1, "device": "cpu"}
+    if timed.recipe:
+        return inputs_of(simulate(**timed.recipe), "cpu")
+    assert folder is not None
+    return inputs_of_real(RealBurst.read(folder, "cpu"), 1)
 
 
 if __name__ == "__main__":

@@ -29,8 +29,8 @@ def find_device(name: str) -> torch.device:
 def settle_threads() -> None:
     """Let torch use no more threads than there are processors for this process, and say so where it would have.
 
-    Threads that wait for a processor hold up all others at the end of every operation: with eight to a processor a
-    reconstruction takes thirty times as long.
+    Threads that wait for a processor hold up all others at the end of every operation, which makes a reconstruction
+    many times as slow.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     processors = len(affinity(0)) if affinity is not None else os.cpu_count() or 1

@@ -120,10 +120,9 @@ def footprint_radius(transmission: Tensor, labels: Tensor, centres: Tensor, pitc
     parts = np.stack([gain * (1 - place + below).clip(0, 1), gain * (place - below).clip(0, 1)])
     design = np.bincount(np.stack([entry, entry + 1]).ravel(), parts.ravel(), len(x) * (knots + 2)).reshape(len(x), -1)
     profile, _ = nnls(design[:, :knots], transmission.cpu().numpy()[y, x].astype(np.float64))
-    stray = max(0.0, np.interp(0.5, np.arange(knots) * _PROFILE_STEP, profile) - _SPREAD * profile.max())
-    radius = np.linspace(0, _OWN_REACH, 200)
-    own = np.interp(radius, np.arange(knots) * _PROFILE_STEP, profile) - stray
-    light = own.clip(0) ** _MOMENT_POWER
+    at, radius = np.arange(knots) * _PROFILE_STEP, np.linspace(0, _OWN_REACH, 200)
+    stray = max(0.0, np.interp(0.5, at, profile) - _SPREAD * profile.max())
+    light = (np.interp(radius, at, profile) - stray).clip(0) ** _MOMENT_POWER
     if not light.any():
         return 0.36 * pitch
     return float(pitch * math.sqrt(2 * (light * radius**3).sum() / (light * radius).sum()))
