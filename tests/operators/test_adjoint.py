@@ -11,7 +11,7 @@ from napari_fiberburst import operators
 from napari_fiberburst.motion.displacement import ControlGrid
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid, Sampling
-from napari_fiberburst.operators.jacobian import ControlSlopes, GeneratorSlopes, JointJacobian
+from napari_fiberburst.operators.jacobian import ControlSlopes, GainSlopes, GeneratorSlopes, JointJacobian
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
 from napari_fiberburst.operators.stencil import Stencil
 
@@ -34,16 +34,13 @@ def points(*shape):
 
 
 def jacobian(motion, footprint):
-    """Return the Jacobian of samples in three frames, some of which share a core, and one core has none."""
+    """Return the Jacobian of samples in three frames."""
     return JointJacobian(
         sampling=GRID.at(points(FRAMES, SAMPLES)),
         footprint=footprint,
-        gains=random(SAMPLES),
-        exposures=random(FRAMES),
-        light=random(FRAMES, SAMPLES),
+        factors=random(FRAMES, SAMPLES),
+        values=random(FRAMES, SAMPLES),
         motion=motion,
-        core_index=torch.arange(SAMPLES) % (CORES - 1),
-        cores=CORES,
     )
 
 
@@ -60,15 +57,18 @@ def operators_to_test():
     yield "stencil", GRID.at(points(SAMPLES)).normal(random(SAMPLES)), scene, random(*GRID.shape)
     for dof in (2, 4, 6, 8):
         for through in (None, footprint):
-            blocks = (scene, random(FRAMES, dof), random(CORES), random(FRAMES))
+            blocks = (scene, random(FRAMES, dof), random(FRAMES))
             name = f"joint jacobian of {dof} generators, {'points' if through is None else 'footprints'}"
             yield name, jacobian(GeneratorSlopes(random(FRAMES, dof, SAMPLES)), through), blocks, samples
+    # Some samples share a core, and one core has none.
+    gains = GainSlopes(random(FRAMES, SAMPLES), torch.arange(SAMPLES) % (CORES - 1), CORES)
+    yield "slopes along gains", gains, random(CORES), samples
     controls = ControlGrid(8.0, (7, 9))
     weights = controls.at(points(SAMPLES).nan_to_num(3.0))
     yield "control points", weights, random(FRAMES, 2, 63), random(FRAMES, 2, SAMPLES)
     yield "slopes along generators", GeneratorSlopes(random(FRAMES, 8, SAMPLES)), random(FRAMES, 8), samples
     bending = ControlSlopes(random(FRAMES, SAMPLES), random(FRAMES, SAMPLES), weights)
-    blocks = (scene, random(FRAMES, 2, 63), random(CORES), random(FRAMES))
+    blocks = (scene, random(FRAMES, 2, 63), random(FRAMES))
     yield "slopes along control points", bending, random(FRAMES, 2, 63), samples
     yield "joint jacobian of control points", jacobian(bending, footprint), blocks, samples
 
@@ -87,6 +87,9 @@ def test_an_operator_and_its_adjoint_agree(operator, taken, given):
     assert given.numel() == 0 or there != 0
 
 
+OPERATORS = {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian, GeneratorSlopes, ControlSlopes, GainSlopes}
+
+
 def test_every_operator_is_in_the_list():
     defined = {
         kind
@@ -95,5 +98,5 @@ def test_every_operator_is_in_the_list():
         if hasattr(kind, "adjoint") and kind.__module__.startswith(operators.__name__)
         if not getattr(kind, "_is_protocol", False)
     }
-    assert defined == {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian, GeneratorSlopes, ControlSlopes}
+    assert defined == OPERATORS
     assert defined <= {type(operator) for _, operator, _, _ in operators_to_test()}

@@ -24,7 +24,7 @@ def solved(points, period, smoothness, radius=None):
     grid = Grid(0.0, 0.0, 1.0, SHAPE)
     empty = NormalEquations.empty(grid, radius, 1, torch.device("cpu"))
     normal = empty.with_samples(points, wave(points, period)[:, None], torch.ones(len(points)))
-    return normal, normal.solve(smoothness, normal.mean(), 200)
+    return normal, normal.solve(smoothness, iterations=200)
 
 
 def everywhere(steps=7):
@@ -85,7 +85,7 @@ def test_an_image_is_as_sharp_between_its_nodes_as_at_them():
 
 def test_an_image_of_nothing_is_finite():
     normal = NormalEquations.empty(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 3, torch.device("cpu"))
-    assert torch.isfinite(normal.image(normal.solve(0.1, normal.mean()), 0.1)).all()
+    assert torch.isfinite(normal.image(normal.solve(0.1), 0.1)).all()
 
 
 def test_a_solution_is_the_exact_one_to_a_part_of_its_finest_detail():
@@ -99,6 +99,6 @@ def test_a_solution_is_the_exact_one_to_a_part_of_its_finest_detail():
     nodes = torch.eye(SHAPE[0] * SHAPE[1]).reshape(-1, *SHAPE)
     matrix = normal.through(normal.stencil(normal.through(nodes))) + smoothness * normal.prior(nodes)
     exact = torch.linalg.solve(matrix.flatten(1).double(), normal.through(normal.rhs).flatten().double())
-    solution = normal.solve(smoothness, normal.mean(), 200)[0]
+    solution = normal.solve(smoothness, iterations=200)[0]
     left = (solution - exact.reshape(SHAPE))[INSIDE]
     assert float(left.std()) < 0.05 * float(exact.reshape(SHAPE)[INSIDE].std())

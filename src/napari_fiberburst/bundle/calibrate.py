@@ -20,7 +20,7 @@ from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, foo
 from napari_fiberburst.bundle.field import find_field, find_marks, widened, without_rim
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
 from napari_fiberburst.bundle.pitch import find_pitch, is_faint
-from napari_fiberburst.bundle.samples import SATURATED, exposed, sample_cores
+from napari_fiberburst.bundle.samples import SATURATED, only_exposed, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
 from napari_fiberburst.operators.filters import blur, local_mean
@@ -72,7 +72,7 @@ def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
     """
     frames = torch.from_numpy(burst.frames).to(find_device(device))
     grey = frames.mean(dim=3)
-    return drain(calibrating(grey, burst, find_marks(grey[exposed(grey)])))
+    return drain(calibrating(grey, burst, find_marks(only_exposed(grey))))
 
 
 def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Generator[str, None, Bundle]:
@@ -81,7 +81,7 @@ def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Genera
     Yields the name of each step that is done.
     """
     origin = {"source": "burst", "bursts": 0, "frames": len(grey)}
-    grey = grey[exposed(grey)]
+    grey = only_exposed(grey)
     mean = grey.mean(dim=0)
     field = find_field(grey, find_pitch(mean))
     mean = torch.where(marks, local_mean(mean, _FILLED_FROM, (~marks).to(mean)), mean)

@@ -171,13 +171,6 @@ class _Patterns:
     def of(cls, images: Tensor, pitch: float) -> "_Patterns":
         """Take the honeycomb out of images (T, H, W)."""
         height, width = images.shape[1:]
-        *envelopes, mass = blur(torch.cat([images, torch.ones_like(images[:1])]), _ENVELOPE * pitch)
-        envelope = torch.stack(envelopes) / mass.clamp_min(1e-4)
-        flat = images / (envelope + _LEAST_LIGHT * steady.mean(envelope)).clamp_min(1e-9) - 1
-        usual = flat.abs().flatten(1).median(dim=1).values[:, None, None]
-        flat = flat.clamp(-_MOST_OF_USUAL * usual, _MOST_OF_USUAL * usual)
-        rows, columns = (torch.hann_window(side, periodic=False).to(images) for side in (height, width))
-        spectra = torch.fft.rfft2(flat * rows[:, None] * columns)
         y, x = torch.meshgrid(
             torch.fft.fftfreq(height, device=images.device),
             torch.fft.rfftfreq(width, device=images.device),
@@ -185,7 +178,10 @@ class _Patterns:
         )
         frequency = torch.hypot(x, y) / ring_frequency(pitch)
         band = (frequency > _BAND[0]) & (frequency < _BAND[1])
-        spectra = spectra[:, band]
+        rows, columns = (torch.hann_window(side, periodic=False).to(images) for side in (height, width))
+        soft, mass = rows[:, None] * columns, blur(torch.ones_like(images[0]), _ENVELOPE * pitch).clamp_min(1e-4)
+        floor = _LEAST_LIGHT * steady.mean(images)
+        spectra = torch.stack([torch.fft.rfft2(soft * _flat(image, mass, floor, pitch))[band] for image in images])
         spectra = spectra / spectra.norm(dim=1, keepdim=True).clamp_min(1e-9)
         frequencies = 2 * math.pi * torch.stack([x[band], y[band]], dim=1)
         return cls(spectra, frequencies, band, (height, width), ring_frequency(pitch))
@@ -241,6 +237,13 @@ class _Patterns:
             step = torch.linalg.solve(safe, slope).clamp(-_MOST_STEP, _MOST_STEP)
             offsets = offsets + step * is_peak[:, None]
         return offsets
+
+
+def _flat(image: Tensor, mass: Tensor, floor: Tensor, pitch: float) -> Tensor:
+    """Return what an image (H, W) has beside its slow changes, relative to these; bright spots count for little."""
+    flat = image / (blur(image, _ENVELOPE * pitch) / mass + floor).clamp_min(1e-9) - 1
+    most = _MOST_OF_USUAL * flat.abs().median()
+    return flat.clamp(-most, most)
 
 
 def _at_rest(frame: Tensor, x: float, y: float) -> Tensor:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import find_cores
-from napari_fiberburst.bundle.samples import exposed
+from napari_fiberburst.bundle.samples import only_exposed
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import BundleError
@@ -109,7 +109,7 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     """
     if not bundle.is_resolved or len(bundle.centres) < _LEAST_CORES:
         return Placement(bundle)
-    mean = grey[exposed(grey)].mean(dim=0)
+    mean = only_exposed(grey).mean(dim=0)
     black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
     flat, lit = (part.cpu() for part in _flattened((mean - black).clamp_min(0), bundle.pitch))
     observed = Observed(image=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))

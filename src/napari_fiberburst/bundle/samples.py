@@ -163,17 +163,25 @@ class BundleTensors:
 def in_grey(frames: Tensor) -> Tensor:
     """Return frames (..., C) averaged over channels, (...), several times as fast as torch does over a last axis."""
     first, *others = frames.unbind(dim=-1)
+    if not others:
+        return first
     total: Tensor = sum(others, first)
     return total / frames.shape[-1]
 
 
 def exposed(frames: Tensor) -> Tensor:
     """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
-    # Several times as fast as torch's own deviation over two axes.
-    deviation = (frames - frames.mean(dim=(1, 2), keepdim=True)).square().mean(dim=(1, 2)).sqrt()
-    bright = (frames >= SATURATED).sum(dim=(1, 2)) / frames[0].numel()
+    # One by one, because what this makes of a frame is as large as it is.
+    deviation = torch.stack([(frame - frame.mean()).square().mean().sqrt() for frame in frames])
+    bright = torch.stack([(frame >= SATURATED).sum() / frame.numel() for frame in frames])
     good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
     return good if bool(good.any()) else torch.ones_like(good)
+
+
+def only_exposed(frames: Tensor) -> Tensor:
+    """Return those of frames (T, H, W) that show something."""
+    good = exposed(frames)
+    return frames if bool(good.all()) else frames[good]
 
 
 def sample(

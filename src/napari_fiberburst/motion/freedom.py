@@ -95,7 +95,7 @@ def restrict(problem: JointProblem, state: JointState) -> Restriction | None:
 
 def _information(problem: JointProblem, state: JointState) -> Tensor:
     """Return the information on each frame's generators, (T, k, k) float64, by the variance of the residuals."""
-    jacobian = linearise(problem, state, FINER[-1])
+    jacobian, _ = linearise(problem, state, FINER[-1])
     assert isinstance(jacobian.motion, GeneratorSlopes)
     _, weights, variance = residuals(problem, jacobian)
     slopes = jacobian.motion.slopes

@@ -24,7 +24,7 @@ from napari_fiberburst.motion.linearised import Linearised, huber
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.motion.problem import COARSE, LEAST_DAMPING, JointProblem, JointState, Level
 from napari_fiberburst.operators import steady
-from napari_fiberburst.operators.filters import blur
+from napari_fiberburst.operators.filters import filled_mean
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Sampling
 
@@ -64,7 +64,7 @@ def start(problem: JointProblem, motion: FrameMotion) -> JointState:
 def _mean_scene(problem: JointProblem, sampling: Sampling, exposures: Tensor) -> Tensor:
     """Return the mean of the frames as they lie, each brought to exposure 1."""
     values, weights = problem.values / exposures[:, None], problem.weights * exposures[:, None] ** 2
-    return scattered_mean(sampling, values, weights, 1.0 / COARSE.spacing)
+    return filled_mean(sampling.adjoint(values * weights), sampling.adjoint(weights), 1.0 / COARSE.spacing)
 
 
 def _common_exposure(problem: JointProblem, exposures: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ def iterate(problem: JointProblem, state: JointState, level: Level, number: int)
     """
     damping = max(level.damping * level.decay**number, LEAST_DAMPING)
     system = Linearised.of(problem, state, level, damping)
-    scene, steps, _, log_exposures = system.solve()
+    scene, steps, log_exposures = system.solve()
     if level.bends:
         motion, farthest = _bent(problem, state.motion, steps)
     else:
@@ -212,17 +212,6 @@ def predict(problem: JointProblem, state: JointState) -> Tensor:
     """Return what the model says of the values, (T, N)."""
     light = state.grid.at(problem.points(state.motion))(state.filtered)
     return state.exposures[:, None] * light * state.gains[problem.core_index]
-
-
-def scattered_mean(sampling: Sampling, values: Tensor, weights: Tensor, sigma: float) -> Tensor:
-    """Return the local mean (H, W) of scattered values, over a Gaussian of `sigma` nodes and wider where none is."""
-    total = torch.stack([sampling.adjoint(values * weights), sampling.adjoint(weights)])
-    near = blur(total, sigma)
-    far = blur(near, 3 * sigma)
-    everywhere = steady.total(total[0]) / steady.total(total[1]).clamp_min(1e-12)
-    faint = 1e-3 * steady.mean(near[1]) + 1e-12
-    filled = (far[0] + faint * everywhere) / (far[1] + faint)
-    return (near[0] + faint * filled) / (near[1] + faint)
 
 
 def _with_best_gains(problem: JointProblem, state: JointState, prior: float) -> JointState:

@@ -1,4 +1,10 @@
-"""One Gauss-Newton step of a joint registration: the normal equations of scene, motion, gains and exposures."""
+"""One Gauss-Newton step of a joint registration: the normal equations of scene, motion, gains and exposures.
+
+The gains are eliminated. No sample has two, so their block D of the normal equations is diagonal, and with C, what they
+share with all others, the step in these solves (A - C D^-1 C') x = b - C D^-1 c, the Schur complement (Golub and Van
+Loan, "Matrix computations", section 3.2). A product with it costs as much as one with the whole, and half as many of
+them are enough: the slowest to settle is what scene and gains share.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,7 +16,7 @@ from napari_fiberburst.motion.displacement import ControlWeights
 from napari_fiberburst.motion.problem import JointProblem, JointState, Level
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.cg import Blocks, conjugate_gradients
-from napari_fiberburst.operators.jacobian import ControlSlopes, GeneratorSlopes, JointJacobian
+from napari_fiberburst.operators.jacobian import ControlSlopes, GainSlopes, GeneratorSlopes, JointJacobian
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE
 
 # In medians of the residuals: larger ones count less (Huber, 1964).
@@ -24,10 +30,8 @@ _EXPOSURE_VARIANCE = 0.01
 # displacement itself is held back.
 _CURVATURE, _RIDGE = 1.8, 1e-3
 # Of conjugate gradients: iterations at most, and the relative error at which they end. A Gauss-Newton step is only
-# right to first order, so solving it further gains nothing; displacements go through more levels instead. Motion is as
-# right after half as many iterations, but what scene and gains share is not: a slope of the gains would be taken for a
-# shading of the light, and frames of a coarse bundle seem to bend.
-_ITERATIONS, _BENDING_ITERATIONS, _TOLERANCE = 24, 12, 1e-2
+# right to first order, so solving it further gains nothing; displacements go through more levels instead.
+_ITERATIONS, _BENDING_ITERATIONS, _TOLERANCE = 12, 8, 1e-2
 
 
 class MotionTerm(Protocol):
@@ -140,6 +144,7 @@ class Linearised:
     """The normal equations of one iteration, J'WJ + priors, in the changes of scene, motion, gains and exposures."""
 
     jacobian: JointJacobian
+    gains: GainSlopes
     motion: MotionTerm
     weights: Tensor
     residual: Tensor
@@ -154,10 +159,11 @@ class Linearised:
     @classmethod
     def of(cls, problem: JointProblem, state: JointState, level: Level, damping: float) -> "Linearised":
         """Linearise at a state."""
-        jacobian = linearise(problem, state, level)
+        jacobian, gains = linearise(problem, state, level)
         residual, weights, variance = residuals(problem, jacobian)
         return cls(
             jacobian=jacobian,
+            gains=gains,
             motion=_motion_term(problem, state, jacobian, weights, damping, variance),
             weights=weights,
             residual=residual,
@@ -172,47 +178,48 @@ class Linearised:
         )
 
     def solve(self) -> Blocks:
-        """Return the changes of scene, motion, gains and log exposures."""
+        """Return the changes of scene, motion and log exposures; the gains are known once these are."""
         jacobian, weights = self.jacobian, self.weights
-        scene, motion, gains, exposures = jacobian.adjoint(weights * self.residual)
+        weighted = weights * self.residual
+        if not self.gains_fixed:
+            follow = 1 / (self.gains.normal_diagonal(weights) + self.gain_prior)
+            pull = self.gains.adjoint(weighted) - self.gain_prior * self.gain_change
+            weighted = weighted - weights * self.gains(follow * pull)
+        scene, motion, exposures = jacobian.adjoint(weighted)
         scene_diagonal = jacobian.sampling.normal_diagonal(weights * jacobian.factors**2)
         scene_inverse = 1 / (scene_diagonal + MEMBRANE.diagonal * self.smoothness)
-        gain_inverse = 1 / (jacobian.per_core(weights * jacobian.light**2) + self.gain_prior)
-        if self.gains_fixed:
-            gain_inverse = torch.zeros_like(gain_inverse)
-        power = (weights * (jacobian.gains * jacobian.light) ** 2).sum(dim=1)
-        exposure_inverse = 1 / (power + self.exposure_prior)
+        exposure_inverse = 1 / ((weights * jacobian.values**2).sum(dim=1) + self.exposure_prior)
+
+        def multiply(blocks: Blocks) -> Blocks:
+            scene, motion, exposures = blocks
+            change = weights * jacobian(blocks)
+            if not self.gains_fixed:
+                change -= weights * self.gains(follow * self.gains.adjoint(change))
+            to_scene, to_motion, to_exposures = jacobian.adjoint(change)
+            return (
+                to_scene + self.smoothness * MEMBRANE(scene),
+                to_motion + self.motion.prior(motion),
+                to_exposures + self.exposure_prior * exposures,
+            )
 
         def precondition(blocks: Blocks) -> Blocks:
-            scene, motion, gains, exposures = blocks
-            moved = self.motion.precondition(motion)
-            return scene * scene_inverse, moved, gains * gain_inverse, exposures * exposure_inverse
+            scene, motion, exposures = blocks
+            return scene * scene_inverse, self.motion.precondition(motion), exposures * exposure_inverse
 
         return conjugate_gradients(
-            self._multiply,
-            (scene, motion + self.motion.pull, gains - self.gain_prior * self.gain_change, exposures),
+            multiply,
+            (scene, motion + self.motion.pull, exposures),
             precondition,
             iterations=self.iterations,
             tolerance=_TOLERANCE,
         )
 
-    def _multiply(self, blocks: Blocks) -> Blocks:
-        scene, motion, gains, exposures = blocks
-        to_scene, to_motion, to_gains, to_exposures = self.jacobian.adjoint(self.weights * self.jacobian(blocks))
-        return (
-            to_scene + self.smoothness * MEMBRANE(scene),
-            to_motion + self.motion.prior(motion),
-            to_gains + self.gain_prior * gains,
-            to_exposures + self.exposure_prior * exposures,
-        )
 
-
-def linearise(problem: JointProblem, state: JointState, level: Level) -> JointJacobian:
-    """Return the Jacobian of `predict` in scene, motion (as the level moves it), gains and log exposures."""
+def linearise(problem: JointProblem, state: JointState, level: Level) -> tuple[JointJacobian, GainSlopes]:
+    """Return the Jacobian of `predict` in scene, motion (as the level moves it) and log exposures, and in gains."""
     points = problem.points(state.motion)
     sampling, filtered = state.grid.at(points), state.filtered
-    gains = state.gains[problem.core_index]
-    factors = state.exposures[:, None] * gains
+    factors = state.exposures[:, None] * state.gains[problem.core_index]
     light, along_x, along_y = sampling.with_slopes(filtered)
     along_x, along_y = along_x * factors, along_y * factors
     motion: GeneratorSlopes | ControlSlopes
@@ -220,16 +227,10 @@ def linearise(problem: JointProblem, state: JointState, level: Level) -> JointJa
         motion = ControlSlopes(along_x, along_y, problem.controls)
     else:
         motion = GeneratorSlopes(state.motion.slopes(points, along_x, along_y, min(level.dof, problem.dof)))
-    return JointJacobian(
-        sampling=sampling,
-        footprint=state.footprint,
-        gains=gains,
-        exposures=state.exposures,
-        light=state.exposures[:, None] * light,
-        motion=motion,
-        core_index=problem.core_index,
-        cores=problem.cores,
+    jacobian = JointJacobian(
+        sampling=sampling, footprint=state.footprint, factors=factors, values=factors * light, motion=motion
     )
+    return jacobian, GainSlopes(state.exposures[:, None] * light, problem.core_index, problem.cores)
 
 
 def _motion_term(
@@ -251,7 +252,7 @@ def _motion_term(
 
 def residuals(problem: JointProblem, jacobian: JointJacobian) -> tuple[Tensor, Tensor, float]:
     """Return what the model leaves (T, N), how much it counts, large residuals less, and its variance."""
-    residual = problem.values - jacobian.gains * jacobian.light
+    residual = problem.values - jacobian.values
     weights = problem.weights * jacobian.sampling.inside
     weights = weights * huber(residual, weights)
     return residual, weights, float(steady.weighted_mean(residual**2, weights))

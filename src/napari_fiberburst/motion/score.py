@@ -32,7 +32,7 @@ def bending_score(problem: JointProblem, state: JointState) -> float:
     still = Displacement.none(len(problem.values), grid, device)
     problem = replace(problem, controls=grid.at(problem.positions))
     state = replace(state, motion=replace(state.motion, displacement=still))
-    jacobian = linearise(problem, state, replace(FINER[-1], bends=True))
+    jacobian, _ = linearise(problem, state, replace(FINER[-1], bends=True))
     slopes = jacobian.motion
     assert isinstance(slopes, ControlSlopes)
     assert problem.controls is not None

@@ -22,6 +22,29 @@ def blur(images: Tensor, sigma: float) -> Tensor:
     return filtered
 
 
+def filled_mean(totals: Tensor, mass: Tensor, sigma: float) -> Tensor:
+    """Return the local mean (..., H, W) of scattered values, over a Gaussian of `sigma` nodes and wider where none is.
+
+    Parameters
+    ----------
+    totals : Tensor
+        (..., H, W), what values times their weights add to each node.
+    mass : Tensor
+        (H, W), what the weights add.
+    sigma : float
+        Nodes.
+    """
+    parts = torch.cat([totals.reshape(-1, *mass.shape), mass[None]])
+    near = blur(parts, sigma)
+    far = blur(near, 3 * sigma)
+    everywhere = torch.stack([steady.total(part) for part in parts])[:-1, None, None]
+    everywhere = everywhere / steady.total(mass).clamp_min(1e-12)
+    faint = 1e-3 * steady.mean(near[-1]) + 1e-12
+    filled = (far[:-1] + faint * everywhere) / (far[-1] + faint)
+    mean: Tensor = (near[:-1] + faint * filled) / (near[-1] + faint)
+    return mean.reshape(totals.shape)
+
+
 def local_mean(image: Tensor, sigma: float, weight: Tensor | None = None) -> Tensor:
     """Return the Gaussian-weighted mean about each node of (H, W); 0 where nothing has weight."""
     weight = torch.ones_like(image) if weight is None else weight

@@ -70,12 +70,46 @@ class ControlSlopes:
         return self.weights.adjoint(torch.stack([values * self.along_x, values * self.along_y], dim=1))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class GainSlopes:
+    """How samples (T, N) change with the gains of their cores, (G,).
+
+    Attributes
+    ----------
+    light : Tensor
+        (T, N), what the samples are at gain 1.
+    core_index : Tensor
+        (N,) int64, which of the gains each sample has.
+    cores : int
+        G.
+    """
+
+    light: Tensor
+    core_index: Tensor
+    cores: int
+
+    def __call__(self, gains: Tensor) -> Tensor:
+        """Return how the samples change by changes of the gains (G,)."""
+        return self.light * gains[self.core_index]
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return the adjoint of values (T, N): (G,)."""
+        return self._per_core(self.light * values)
+
+    def normal_diagonal(self, weights: Tensor) -> Tensor:
+        """Return the diagonal of A' W A, (G,), which is all of it; W are weights (T, N)."""
+        return self._per_core(weights * self.light**2)
+
+    def _per_core(self, values: Tensor) -> Tensor:
+        return torch.zeros(self.cores).to(values).index_add_(0, self.core_index, values.sum(dim=0))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JointJacobian:
-    """The Jacobian of v_tn = a_t g_n (B s)(T_t x_n) in scene s, motion T, gains g and exposures a.
+    """The Jacobian of v_tn = a_t g_n (B s)(T_t x_n) in scene s, motion T and exposures a.
 
-    Blocks are the changes of the scene (H, W), of the motion as `motion` takes it, of the gains (G,), and of the
-    logarithms of the exposures (T,); samples are (T, N).
+    Blocks are the changes of the scene (H, W), of the motion as `motion` takes it, and of the logarithms of the
+    exposures (T,); samples are (T, N). Those of the gains are `GainSlopes`.
 
     Attributes
     ----------
@@ -83,48 +117,29 @@ class JointJacobian:
         At the points T_t x_n, (T, N).
     footprint : Footprint or None
         B; None for points.
-    gains : Tensor
-        (N,) g_n, of each sample.
-    exposures : Tensor
-        (T,) a_t.
-    light : Tensor
-        (T, N), a_t (B s)(T_t x_n).
+    factors : Tensor
+        (T, N), a_t g_n.
+    values : Tensor
+        (T, N), v_tn.
     motion : GeneratorSlopes or ControlSlopes
-        Of a_t g_n B s.
-    core_index : Tensor
-        (N,) int64, which of the gains each sample has.
-    cores : int
-        G.
+        Of v_tn.
     """
 
     sampling: Sampling
     footprint: Footprint | None
-    gains: Tensor
-    exposures: Tensor
-    light: Tensor
+    factors: Tensor
+    values: Tensor
     motion: GeneratorSlopes | ControlSlopes
-    core_index: Tensor
-    cores: int
 
     def __call__(self, blocks: Blocks) -> Tensor:
         """Return how the samples change."""
-        scene, motion, gains, exposures = blocks
+        scene, motion, exposures = blocks
         filtered = scene if self.footprint is None else self.footprint(scene)
-        change = self.factors * self.sampling(filtered) + self.motion(motion)
-        return change + self.light * (gains[self.core_index] + self.gains * exposures[:, None])
+        change = self.motion(motion).addcmul_(self.factors, self.sampling(filtered))
+        return change.addcmul_(self.values, exposures[:, None])
 
     def adjoint(self, values: Tensor) -> Blocks:
-        """Return the adjoint's scene, motion, gains and exposures."""
+        """Return the adjoint's scene, motion and exposures."""
         scene = self.sampling.adjoint(values * self.factors)
         scene = scene if self.footprint is None else self.footprint.adjoint(scene)
-        through = values * self.light
-        return scene, self.motion.adjoint(values), self.per_core(through), through @ self.gains
-
-    @property
-    def factors(self) -> Tensor:
-        """(T, N), a_t g_n."""
-        return self.exposures[:, None] * self.gains
-
-    def per_core(self, values: Tensor) -> Tensor:
-        """Return the sum of values (T, N) over the samples of each core, (G,)."""
-        return torch.zeros(self.cores).to(values).index_add_(0, self.core_index, values.sum(dim=0))
+        return scene, self.motion.adjoint(values), (values * self.values).sum(dim=1)

@@ -147,7 +147,7 @@ def _held_to_others(
         light[part.frame] = part.light[:, 0]
     wrong = replace(samples, values=(signs * light)[..., None])
     equations = assemble(scene.grid, wrong, points)
-    followed = equations.through(equations.solve(scene.smoothness, equations.mean(), _PROBE_ITERATIONS))
+    followed = equations.through(equations.solve(scene.smoothness, iterations=_PROBE_ITERATIONS))
     agreement = power = torch.zeros(()).to(points)
     for part in predict(wrong, points, scene.grid, followed):
         agreement = agreement + steady.total(part.weights * (part.values * part.light)[:, 0])

@@ -19,7 +19,7 @@ from napari_fiberburst.bundle.field import find_marks, widened
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
-from napari_fiberburst.bundle.samples import Samples, exposed, in_grey, sample_cores, sample_pixels, shows_detail
+from napari_fiberburst.bundle.samples import Samples, in_grey, only_exposed, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
@@ -135,7 +135,7 @@ class Stages:
         self._burst, self._method, self._seed, self._given = burst, method, seed, given
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = in_grey(self._frames)
-        self._marks = find_marks(self._grey[exposed(self._grey)])
+        self._marks = find_marks(only_exposed(self._grey))
         self._taken: tuple[Bundle, dict[int, Samples]] | None = None
 
     def align(self) -> Generator[Fitted | None, None, Fitted]:

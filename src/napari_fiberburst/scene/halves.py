@@ -15,7 +15,7 @@ from napari_fiberburst.scene.spline import assemble
 
 # Between nodes, in pitches, and where samples are pixels at most in those: a comparison needs no finer detail.
 _SPACING, _SPACING_OF_PIXELS = 0.5, 2.0
-_ITERATIONS = 30
+_ITERATIONS = 16
 # In nodes, over which the density of samples is averaged; and the part of the highest density that both halves need.
 _NEAR, _LEAST_DENSITY = 1.5, 0.15
 _LEAST_NODES = 10
@@ -51,7 +51,7 @@ def disagreement(samples: Samples, points: Tensor, frames: NDArray[np.intp]) -> 
     shown, densities = [], []
     for half in (frames[: len(frames) // 2], frames[len(frames) // 2 :]):
         normal = assemble(grid, in_grey, points, among_frames(half, samples))
-        shown.append(normal.through(normal.solve(UNTOLD, normal.mean(), _ITERATIONS))[0])
+        shown.append(normal.through(normal.solve(UNTOLD, iterations=_ITERATIONS))[0])
         densities.append(blur(normal.density(), _NEAR))
     both = torch.minimum(*densities) > _LEAST_DENSITY * torch.maximum(*densities).max()
     if int(both.sum()) < _LEAST_NODES:

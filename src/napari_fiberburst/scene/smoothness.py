@@ -15,15 +15,15 @@ from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import RingSpectra, correlation_of, ring_spectra
 from napari_fiberburst.scene.prediction import misfit
-from napari_fiberburst.scene.spline import NormalEquations, assemble
+from napari_fiberburst.scene.spline import assemble
 
 # Smoothness is looked for among these where neighbours tell, and between them.
 _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
-# Where halves of the burst tell, it is looked for among these. Halves are solved with the last of some that fall off,
-# each started from the one before: so rough that even the finest detail is in them.
+_STILL_ITERATIONS = 40
+# Where halves of the burst tell, it is looked for among these; the halves' own is so rough that even the finest detail
+# is in them.
 _CANDIDATES = np.geomspace(10, 3e-4, 120)
-_OF_HALVES = (0.3, 0.03, 0.003)
-_ITERATIONS = 40
+_ROUGH = 0.003
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
 # Smoothness is chosen in a window of at most this many nodes a side.
@@ -79,12 +79,11 @@ def choose_smoothness(
     sampled = (both > 0.2 * both.max()) & (both > 0)
     if not bool(sampled.any()):
         return Smoothness(UNTOLD, None)
-    rough = _OF_HALVES[-1]
-    first, second = (half.image(_path(half, _OF_HALVES)[-1], rough)[0].cpu().numpy() for half in halves)
+    first, second = (half.image(half.solve(_ROUGH), _ROUGH)[0].cpu().numpy() for half in halves)
     soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
     spectra = ring_spectra(first, second, soft)
     density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in halves]))
-    errors = _expected_error(spectra, *halves[0].responses(spectra.frequency), density, rough)
+    errors = _expected_error(spectra, *halves[0].responses(spectra.frequency), density, _ROUGH)
     resolution = window.spacing * correlation_of(spectra).resolution
     weight = float(_CANDIDATES[np.argmin(errors)]) if np.isfinite(errors).all() else UNTOLD
     return Smoothness(weight, resolution if math.isfinite(resolution) else None)
@@ -151,7 +150,9 @@ def choose_among_neighbours(
     for left in range(_FOLDS):
         normal = assemble(window, in_grey, points, taking_part & (fold != left))
         asked = taking_part & (fold == left)
-        for index, guess in enumerate(_path(normal, _STILL_CANDIDATES)):
+        guess = None
+        for index, smoothness in enumerate(_STILL_CANDIDATES):
+            guess = normal.solve(smoothness, guess, _STILL_ITERATIONS)
             risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]
     return Smoothness(_lowest(risks, _STILL_CANDIDATES) if risks.any() else UNTOLD, None)
 
@@ -161,16 +162,6 @@ def among_frames(frames: NDArray[np.intp], samples: Samples) -> Tensor:
     among = torch.zeros(len(samples.weights), 1, dtype=torch.bool)
     among[torch.from_numpy(frames)] = True
     return among.to(samples.weights.device)
-
-
-def _path(normal: NormalEquations, candidates: tuple[float, ...]) -> list[Tensor]:
-    """Return the scenes of all candidates, each started from the smoother one before."""
-    scene = normal.mean()
-    scenes = []
-    for smoothness in candidates:
-        scene = normal.solve(smoothness, scene, _ITERATIONS)
-        scenes.append(scene)
-    return scenes
 
 
 def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> float:

@@ -21,11 +21,12 @@ from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
 
-# Iterations of conjugate gradients, at most, for a scene on the way, from an even one. Gains and outliers are told by
-# that scene, so it has to have settled where few frames look, too: after 25 it has the colour of the mean at the rim of
-# a round field, which cores there would be given gains for.
-_DRAFT_ITERATIONS = 60
-PREVIEW_ITERATIONS = 12
+# Iterations of conjugate gradients, at most, for a scene on the way. Gains and outliers are told by that scene, so it
+# has to have settled where few frames look, too.
+_DRAFT_ITERATIONS = 32
+# From a scene that misses only some of the samples, or has some that it should not.
+_MORE_ITERATIONS = 24
+PREVIEW_ITERATIONS = 8
 # Outliers are looked for so many times: in the first scene, they are in the scene too.
 _OUTLIER_ROUNDS = 2
 
@@ -131,7 +132,11 @@ def grid_over(bounds: tuple[float, float, float, float], spacing: float, reach: 
 def solve_quickly(samples: Samples, registration: Registration, grid: Grid, smoothness: float | None) -> Scene:
     """Return a first scene, for a preview."""
     return _draft(
-        registration.correct(samples), registration.points(samples.positions), grid, smoothness, PREVIEW_ITERATIONS
+        registration.correct(samples),
+        registration.points(samples.positions),
+        grid,
+        smoothness,
+        iterations=PREVIEW_ITERATIONS,
     )
 
 
@@ -140,7 +145,7 @@ def prediction_error(samples: Samples, registration: Registration, grid: Grid, *
     samples, points = registration.correct(samples), registration.points(samples.positions)
     left_out = _left_out(samples, 0.1, seed)
     equations = assemble(grid, samples, points, (~left_out).to(points))
-    coefficients = equations.solve(UNTOLD, equations.mean(), _DRAFT_ITERATIONS)
+    coefficients = equations.solve(UNTOLD, iterations=_DRAFT_ITERATIONS)
     missed, mass = misfit(samples, points, grid, equations.through(coefficients), left_out)
     light = float(steady.weighted_mean(samples.grey, samples.weights))
     return (missed / mass) ** 0.5 / max(light, 1e-9) if mass > 0 else math.inf
@@ -158,10 +163,10 @@ def solving(
     """Solve as `solve` does; yields a draft, twice, and the scene before held-out samples are taken in."""
     samples = registration.correct(samples)
     points = registration.points(samples.positions)
-    scene = _draft(samples, points, grid, smoothness, _DRAFT_ITERATIONS)
+    scene = _draft(samples, points, grid, smoothness)
     if not registration.is_still:
         samples, gains = refine_gains(samples, points, grid, scene.filtered)
-        scene = _without_outliers(replace(scene, samples=samples, gains=gains), points, smoothness)
+        scene = _without_outliers(replace(scene, samples=samples, gains=gains), points)
         samples = scene.samples
     yield scene
     chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
@@ -183,28 +188,42 @@ def solving(
     if not left_out.any():
         return scene
     equations = equations + assemble(grid, samples, points, left_out.to(points))
-    return replace(scene, coefficients=equations.solve(chosen.weight, coefficients), equations=equations)
+    return replace(
+        scene, coefficients=equations.solve(chosen.weight, coefficients, _MORE_ITERATIONS), equations=equations
+    )
 
 
-def _draft(samples: Samples, points: Tensor, grid: Grid, smoothness: float | None, iterations: int) -> Scene:
+def _draft(
+    samples: Samples,
+    points: Tensor,
+    grid: Grid,
+    smoothness: float | None,
+    iterations: int = _DRAFT_ITERATIONS,
+) -> Scene:
     equations = assemble(grid, samples, points)
     weight = UNTOLD if smoothness is None else smoothness
-    coefficients = equations.solve(weight, equations.mean(), iterations)
+    coefficients = equations.solve(weight, iterations=iterations)
     return Scene(coefficients=coefficients, smoothness=weight, equations=equations, samples=samples, gains=GainChange())
 
 
-def _without_outliers(scene: Scene, points: Tensor, smoothness: float | None) -> Scene:
-    """Return the scene without samples that show something else, which are looked for again once the first are out."""
+def _without_outliers(scene: Scene, points: Tensor) -> Scene:
+    """Return the scene from samples without those that show something else; its coefficients are as they were.
+
+    They are told in grey, and looked for again in a scene without the first.
+    """
     samples = scene.samples
+    grey = replace(samples, values=samples.grey[..., None])
+    coefficients, filtered = (part.mean(dim=0, keepdim=True) for part in (scene.coefficients, scene.filtered))
     outliers = torch.zeros_like(samples.weights, dtype=torch.bool)
-    for _ in range(_OUTLIER_ROUNDS):
-        outliers = find_outliers(samples, points, scene.grid, scene.filtered)
+    for number in range(_OUTLIER_ROUNDS):
+        if number > 0:
+            equations = assemble(scene.grid, replace(grey, weights=grey.weights * ~outliers), points)
+            coefficients = equations.solve(scene.smoothness, coefficients, _MORE_ITERATIONS)
+            filtered = equations.through(coefficients)
+        outliers = find_outliers(grey, points, scene.grid, filtered)
         if not bool(outliers.any()):
             break
-        left = replace(samples, weights=samples.weights * ~outliers)
-        draft = _draft(left, points, scene.grid, smoothness, _DRAFT_ITERATIONS)
-        scene = replace(draft, gains=scene.gains)
-    return replace(scene, outliers=outliers)
+    return replace(scene, samples=replace(samples, weights=samples.weights * ~outliers), outliers=outliers)
 
 
 def _choose(scene: Scene, points: Tensor, registration: Registration) -> Smoothness:
