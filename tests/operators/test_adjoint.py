@@ -10,7 +10,7 @@ import torch
 from napari_fiberburst import operators
 from napari_fiberburst.motion.displacement import ControlGrid
 from napari_fiberburst.operators.footprint import Footprint
-from napari_fiberburst.operators.grid import Grid, Sampling
+from napari_fiberburst.operators.grid import Grid, PathSampling, Sampling
 from napari_fiberburst.operators.jacobian import ControlSlopes, GainSlopes, GeneratorSlopes, JointJacobian
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
 from napari_fiberburst.operators.stencil import Stencil
@@ -50,6 +50,7 @@ def operators_to_test():
     scene, samples = random(*GRID.shape), random(FRAMES, SAMPLES)
     yield "sampling", GRID.at(points(FRAMES, SAMPLES)), scene, samples
     yield "sampling of no points", GRID.at(points(1)[:0]), scene, random(0)
+    yield "sampling along paths", GRID.along(points(FRAMES, SAMPLES, 5)), scene, samples
     yield "footprint", footprint, scene, random(*GRID.shape)
     yield "footprint smaller than a pixel", Footprint(GRID, 0.2, torch.device("cpu")), scene, random(*GRID.shape)
     yield "membrane", MEMBRANE, scene, random(*GRID.shape)
@@ -87,7 +88,17 @@ def test_an_operator_and_its_adjoint_agree(operator, taken, given):
     assert given.numel() == 0 or there != 0
 
 
-OPERATORS = {Sampling, Footprint, SmoothnessPrior, Stencil, JointJacobian, GeneratorSlopes, ControlSlopes, GainSlopes}
+OPERATORS = {
+    Sampling,
+    PathSampling,
+    Footprint,
+    SmoothnessPrior,
+    Stencil,
+    JointJacobian,
+    GeneratorSlopes,
+    ControlSlopes,
+    GainSlopes,
+}
 
 
 def test_every_operator_is_in_the_list():

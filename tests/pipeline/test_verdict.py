@@ -97,6 +97,7 @@ FIT = GoodnessOfFit(
     core_misfit=np.full(300, 2.0, np.float32),
     structure=0.04,
     still=0.7,
+    smear=0.0,
     is_noise_known=True,
 )
 
@@ -117,6 +118,7 @@ def test_each_sign_of_a_fault_is_a_reason_of_its_own():
         {"still": 5.0},
         {"structure": 0.4, "error": 0.15, "disagreement": 0.2},
         {"structure": -0.1},
+        {"smear": 4.0, "structure": -0.1},
         {"frame_misfit": uneven, "error": 0.15, "disagreement": 0.2},
         {"core_misfit": spoilt, "error": 0.15, "disagreement": 0.2},
     ]

@@ -65,6 +65,10 @@ class Grid:
         """Return the operator that samples images at points (..., 2)."""
         return Sampling(self, points)
 
+    def along(self, paths: Tensor) -> "PathSampling":
+        """Return the operator that samples the means of images along paths (..., K, 2) of K points."""
+        return PathSampling(self, paths)
+
 
 class Sampling:
     """Bilinear interpolation at fixed points: calling it samples an image, its adjoint splats values onto the nodes.
@@ -154,6 +158,40 @@ class Sampling:
         total = torch.zeros(rows * columns, dtype=values.dtype, device=values.device)
         total.scatter_add_(0, index.reshape(-1), values.reshape(-1))
         return total.reshape(rows, columns)
+
+
+class PathSampling:
+    """The mean over K fixed points for each sample, as `Sampling` interpolates at them.
+
+    Parameters
+    ----------
+    grid : Grid
+        The nodes.
+    paths : Tensor
+        (..., K, 2) as (x, y).
+
+    Attributes
+    ----------
+    inside : Tensor
+        (...) bool, which paths lie between nodes.
+    """
+
+    def __init__(self, grid: Grid, paths: Tensor) -> None:
+        self._points = grid.at(paths)
+        self.inside = self._points.inside.all(dim=-1)
+
+    def __call__(self, image: Tensor) -> Tensor:
+        """Return the means of an image (H, W), (...)."""
+        return self._points(image).mean(dim=-1)
+
+    def adjoint(self, values: Tensor) -> Tensor:
+        """Return what values (...) add to the nodes, (H, W)."""
+        count = self._points.inside.shape[-1]
+        return self._points.adjoint((values / count)[..., None].expand(*values.shape, count))
+
+    def of_channels(self, images: Tensor) -> Tensor:
+        """Return the means of images (C, H, W), (..., C)."""
+        return self._points.of_channels(images).mean(dim=-2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,6 +23,7 @@ from napari_fiberburst.pipeline.verdict import collect, judge
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
 from napari_fiberburst.scene.prediction import predict
+from napari_fiberburst.scene.smear import Smear
 from napari_fiberburst.scene.solve import Scene
 from napari_fiberburst.scene.spline import assemble
 
@@ -70,10 +71,11 @@ def diagnose(
     """
     samples = scene.samples
     points = registration.points(samples.positions)
+    looks = scene.looks(points)
     canvas = Canvas.over((0, 0, samples.shape[1], samples.shape[0])) if canvas is None else canvas
     span = acquisition.white_level - acquisition.black_level
-    ratios, weights = measured_gains(samples, points, scene.grid, scene.filtered)
-    ratios, weights = _held_to_others(ratios, weights, scene, points, registration)
+    ratios, weights = measured_gains(samples, looks, scene.grid, scene.filtered)
+    ratios, weights = _held_to_others(ratios, weights, scene, looks, registration)
     found = Diagnostics(
         coverage=_coverage(samples, points, registration, scene.grid, canvas),
         context=frames_behind(samples, points, registration.used, canvas),
@@ -89,7 +91,7 @@ def diagnose(
     )
     if not is_scene_shown:
         return found
-    residuals, variance = _residuals(samples, points, scene)
+    residuals, variance = _residuals(samples, looks, scene)
     most = max(float(scene.coefficients.std()), 1e-6)
     std = scene.equations.posterior_std(scene.smoothness, variance, most, max(1.0, bundle.radius))
     expected = scene.grid.at(_places(canvas, std))(std)
@@ -99,7 +101,7 @@ def diagnose(
         found,
         quality=verdict.quality,
         misfit=fit.misfit if math.isfinite(fit.misfit) else None,
-        notes=(*notes, *verdict.reasons),
+        notes=(*notes, *_told(scene.smear), *verdict.reasons),
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
         residuals=(residuals * span).cpu().numpy().astype(np.float32),
         held_out_rmse=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
@@ -119,6 +121,15 @@ def _variance(
     factors = exposures[:, None] * gains[samples.core_index]
     taken = replace(samples, values=samples.grey[..., None] * factors[..., None])
     return samples.values.shape[2] * noise.of_samples(bundle, acquisition, taken) / factors**2
+
+
+def _told(smear: Smear | None) -> tuple[str, ...]:
+    """Return what a user should know of frames that moved while they were exposed."""
+    if smear is None:
+        return ()
+    return (
+        f"frames moved by {smear.length:.1f} px (rms) while they were exposed; the scene is solved along their paths",
+    )
 
 
 def _per_core(outliers: Tensor, samples: Samples) -> NDArray[np.bool_]:

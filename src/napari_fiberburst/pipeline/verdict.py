@@ -52,6 +52,8 @@ _STRUCTURE, _BLURRED = 0.12, -0.03
 _STILL_PATTERN = 2.2
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
 _SHORT_TRAVEL = 0.4
+# In pitches, root mean square: frames that moved farther while they were exposed show no more of what lies along it.
+_LONG_SMEAR = 0.6
 # Frames that take part, at least; and as a part of all.
 _FEW_FRAMES, _LEAST_USED = 4, 0.5
 # In pitches, or pixels where these are the samples, the distance within which samples are neighbours; so many pairs of
@@ -84,6 +86,8 @@ class GoodnessOfFit:
     still : float
         Power of what the residuals of a place have alike in all frames, over what noise as strong as their changes
         would leave there: 1 for noise, less where gains were fitted.
+    smear : float
+        How far the frames moved while they were exposed, pixels (root mean square); 0 where that is not seen.
     is_noise_known : bool
         Whether the noise was measured. Otherwise misfits are relative to 1 at full scale, and noise is what
         neighbouring samples do not share.
@@ -96,6 +100,7 @@ class GoodnessOfFit:
     core_misfit: NDArray[np.float32]
     structure: float
     still: float
+    smear: float
     is_noise_known: bool
 
     @property
@@ -170,7 +175,7 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
     samples = scene.samples
     channels = samples.values.shape[2]
     points = registration.points(samples.positions)
-    left = _residuals(scene, points)
+    left = _residuals(scene, scene.looks(points))
     shared, structure = _neighbours(left, samples)
     mass = samples.weights * left.known
     if variance is None:
@@ -195,6 +200,7 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
         core_misfit=of_cores.cpu().numpy().astype(np.float32),
         structure=structure,
         still=_still_power(left),
+        smear=0.0 if scene.smear is None else scene.smear.length,
         is_noise_known=variance is not None,
     )
 
@@ -243,7 +249,12 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
         reasons.append(
             "what the image leaves unexplained is alike in neighbouring cores, so something else than noise is in it"
         )
-    if fit.is_noise_known and fit.structure < _BLURRED:
+    if fit.smear > _LONG_SMEAR * pitch:
+        reasons.append(
+            f"frames moved by {fit.smear:.1f} px while they were exposed: detail along the motion is lost; a shorter "
+            "exposure shows it"
+        )
+    elif fit.is_noise_known and fit.structure < _BLURRED:
         reasons.append("edges are sharper in some frames than in others: the object moved while frames were exposed")
     if fit.unevenness > 1 + _UNEVEN_FRAMES * gaps and is_material:
         reasons.append("many frames fit much worse than others: they are blurred, or out of focus")

@@ -40,7 +40,7 @@ def predict(
     samples : Samples
         As they were taken.
     points : Tensor
-        (T, N, 2), where they lie in the scene.
+        (T, N, 2), where they look in the scene; (T, N, K, 2) where that moves while a frame is exposed.
     grid : Grid
         Of the scene.
     filtered : Tensor
@@ -55,7 +55,7 @@ def predict(
         values, places = samples.values[frame], points[frame]
         if among is not None:
             values, places, weights = values[chosen], places[chosen], weights[chosen]
-        sampling = grid.at(places)
+        sampling = grid.at(places) if places.dim() == 2 else grid.along(places)
         yield Prediction(frame, values, sampling.of_channels(filtered), weights * sampling.inside)
 
 

@@ -16,6 +16,7 @@ from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import RingSpectra, correlation_of, ring_spectra
 from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.spline import assemble
+from napari_fiberburst.scene.window import liveliest
 
 # Smoothness is looked for among these where neighbours tell, and between them.
 _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
@@ -63,7 +64,7 @@ def choose_smoothness(
     Parameters
     ----------
     samples, points
-        The samples, and where they lie (T, N, 2).
+        The samples, and where they look (T, N, 2), or (T, N, K, 2) where that moves.
     frames : numpy.ndarray
         Numbers of the frames that take part, at least two.
     grid : Grid
@@ -71,7 +72,7 @@ def choose_smoothness(
     scene : Tensor
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
-    window = _window(grid, scene)
+    window = liveliest(grid, scene, _WINDOW)
     in_grey = replace(samples, values=samples.grey[..., None])
     halves = [assemble(window, in_grey, points, among_frames(half, samples)) for half in (frames[::2], frames[1::2])]
     densities = [blur(half.density(), 3.0) for half in halves]
@@ -142,7 +143,7 @@ def choose_among_neighbours(
 
     Parameters are those of `choose_smoothness`; one frame is enough.
     """
-    window = _window(grid, scene)
+    window = liveliest(grid, scene, _WINDOW)
     in_grey, taking_part = replace(samples, values=samples.grey[..., None]), among_frames(frames, samples)
     count = samples.weights.shape[1]
     fold = torch.randperm(count, generator=torch.Generator().manual_seed(0)).to(points.device) % _FOLDS
@@ -174,14 +175,3 @@ def _lowest(risks: NDArray[np.float64], candidates: tuple[float, ...]) -> float:
     curve = np.polyfit(exponents[near], np.log(risks[near] + 1e-300), 2)
     lowest = -curve[1] / (2 * curve[0]) if curve[0] > 0 else exponents[index]
     return float(10 ** np.clip(lowest, exponents[index + 1], exponents[index - 1]))
-
-
-def _window(grid: Grid, scene: Tensor) -> Grid:
-    """Return the part of a grid, of limited size, in which the scene changes most."""
-    rows, columns = (min(_WINDOW, side) for side in grid.shape)
-    change = torch.zeros_like(scene)
-    change[:-1, :-1] = (scene[1:, :-1] - scene[:-1, :-1]).abs() + (scene[:-1, 1:] - scene[:-1, :-1]).abs()
-    total = torch.nn.functional.pad(change.cumsum(0).cumsum(1), (1, 0, 1, 0))
-    sums = total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
-    row, column = divmod(int(sums.argmax()), sums.shape[1])
-    return Grid(grid.x0 + column * grid.spacing, grid.y0 + row * grid.spacing, grid.spacing, (rows, columns))

@@ -16,6 +16,7 @@ from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.gains import GainChange, refine_gains
 from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.prediction import misfit
+from napari_fiberburst.scene.smear import Smear, find_smear
 from napari_fiberburst.scene.smoothness import UNTOLD, Smoothness, choose_among_neighbours, choose_smoothness
 from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.steps import drain
@@ -49,6 +50,8 @@ class Scene(Stored):
         That were taken out of the samples on the way.
     outliers : Tensor or None
         (T, N) bool, samples that show something else, and have no weight; None where they have not been looked for.
+    smear : Smear or None
+        How the frames moved while they were exposed; None where that was not seen.
     is_draft : bool
         Whether its smoothness is a usual one that has not been chosen yet.
     resolution : float or None
@@ -65,6 +68,7 @@ class Scene(Stored):
     samples: Samples
     gains: GainChange
     outliers: Tensor | None = None
+    smear: Smear | None = None
     is_draft: bool = True
     resolution: float | None = None
     held_out_rmse: float | None = None
@@ -73,6 +77,10 @@ class Scene(Stored):
     def grid(self) -> Grid:
         """Where the nodes are."""
         return self.equations.grid
+
+    def looks(self, points: Tensor) -> Tensor:
+        """Return where samples that lie at points (T, N, 2) look: these, or (T, N, K, 2) where they moved meanwhile."""
+        return points if self.smear is None else self.smear.paths(points)
 
     @property
     def filtered(self) -> Tensor:
@@ -168,6 +176,9 @@ def solving(
         samples, gains = refine_gains(samples, points, grid, scene.filtered)
         scene = _without_outliers(replace(scene, samples=samples, gains=gains), points)
         samples = scene.samples
+        smear = find_smear(samples, points, np.flatnonzero(registration.used), grid, scene.filtered, scene.coefficients)
+        scene = replace(scene, smear=smear)
+        points = scene.looks(points)
     yield scene
     chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
     scene = replace(scene, resolution=chosen.resolution)
@@ -180,7 +191,7 @@ def solving(
         scene,
         coefficients=coefficients,
         smoothness=chosen.weight,
-        equations=equations,
+        equations=equations.without_paths(),
         is_draft=False,
         held_out_rmse=(missed / mass) ** 0.5 if mass > 0 else None,
     )
@@ -188,9 +199,8 @@ def solving(
     if not left_out.any():
         return scene
     equations = equations + assemble(grid, samples, points, left_out.to(points))
-    return replace(
-        scene, coefficients=equations.solve(chosen.weight, coefficients, _MORE_ITERATIONS), equations=equations
-    )
+    coefficients = equations.solve(chosen.weight, coefficients, _MORE_ITERATIONS)
+    return replace(scene, coefficients=coefficients, equations=equations.without_paths())
 
 
 def _draft(

@@ -28,7 +28,7 @@ from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_images
 from napari_fiberburst.operators.filters import blur, filled_mean
 from napari_fiberburst.operators.footprint import Footprint
-from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.operators.grid import Grid, PathSampling
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
 from napari_fiberburst.operators.stencil import Stencil
 
@@ -58,12 +58,17 @@ class NormalEquations:
         (5, H, W), S^T W S as a `Stencil`.
     rhs : Tensor
         (C, H, W), S^T W v.
+    paths : tuple
+        Samples that looked along paths while a frame was exposed, and their weights: they tie together nodes that are
+        no neighbours, so each product goes through them, and `bands` is of the middle of their paths. Empty for
+        samples that stood still.
     """
 
     grid: Grid
     radius: float | None
     bands: Tensor
     rhs: Tensor
+    paths: tuple[tuple[PathSampling, Tensor], ...] = ()
 
     @classmethod
     def empty(cls, grid: Grid, radius: float | None, channels: int, device: torch.device) -> "NormalEquations":
@@ -73,16 +78,49 @@ class NormalEquations:
         )
 
     def with_samples(self, points: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
-        """Return the equations with samples at points (..., 2) of values (..., C) and weights (...)."""
+        """Return the equations with samples of values (..., C) and weights (...), at points (..., 2) or along paths.
+
+        Paths are (..., K, 2).
+        """
         used = weights > 0
-        sampling, values, weights = self.grid.at(points[used]), values[used], weights[used]
+        points, values, weights = points[used], values[used], weights[used]
+        if points.dim() == 3:
+            return self._with_paths(points, values, weights)
+        sampling = self.grid.at(points)
         rhs = torch.stack(
             [light + sampling.adjoint(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
         )
         return replace(self, bands=self.bands + sampling.normal(weights).bands, rhs=rhs)
 
+    def _with_paths(self, paths: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
+        sampling = self.grid.along(paths)
+        weights = weights * sampling.inside
+        middle = self.grid.at(paths[:, paths.shape[1] // 2])
+        rhs = torch.stack(
+            [light + sampling.adjoint(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
+        )
+        bands = self.bands + middle.normal(weights).bands
+        return replace(self, bands=bands, rhs=rhs, paths=(*self.paths, (sampling, weights)))
+
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
-        return replace(self, bands=self.bands + other.bands, rhs=self.rhs + other.rhs)
+        paths = (*self.paths, *other.paths)
+        return replace(self, bands=self.bands + other.bands, rhs=self.rhs + other.rhs, paths=paths)
+
+    def without_paths(self) -> "NormalEquations":
+        """Return the equations to keep once they are solved: of the middle of each path."""
+        return replace(self, paths=())
+
+    def normal(self, seen: Tensor) -> Tensor:
+        """Return S^T W S times scenes (C, H, W) as samples see them through their footprint."""
+        if not self.paths:
+            return self.stencil(seen)
+        return torch.stack([self._along_paths(channel) for channel in seen])
+
+    def _along_paths(self, channel: Tensor) -> Tensor:
+        total = torch.zeros_like(channel)
+        for sampling, weights in self.paths:
+            total += sampling.adjoint(weights * sampling(channel))
+        return total
 
     @property
     def stencil(self) -> Stencil:
@@ -123,7 +161,7 @@ class NormalEquations:
 
         def multiply(blocks: Blocks) -> Blocks:
             (scene,) = blocks
-            return (self.through(self.stencil(self.through(scene))) + weight * self.prior(scene),)
+            return (self.through(self.normal(self.through(scene))) + weight * self.prior(scene),)
 
         (scene,) = conjugate_gradients(
             multiply,
@@ -224,7 +262,7 @@ def _read_gain(frequency: Tensor, offset_variance: Tensor) -> tuple[Tensor, Tens
 
 
 def assemble(grid: Grid, samples: Samples, points: Tensor, among: Tensor | None = None) -> NormalEquations:
-    """Return the normal equations of samples at points (T, N, 2) of the scene.
+    """Return the normal equations of samples at points (T, N, 2) of the scene, or along paths (T, N, K, 2).
 
     `among` (T, N) multiplies the weights: 0 leaves samples out.
     """

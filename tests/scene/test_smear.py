@@ -1,0 +1,91 @@
+"""Frames that moved while they were exposed are seen to, and the scene is solved along the way that they went."""
+
+import numpy as np
+import pytest
+import torch
+
+from napari_fiberburst import reconstruct
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.pipeline.diagnose import diagnose
+from napari_fiberburst.quality import psnr
+from napari_fiberburst.scene.smear import Smear
+from napari_fiberburst.scene.solve import Scene
+from napari_fiberburst.scene.spline import assemble
+from napari_fiberburst.simulation import Camera, Faults, simulate
+
+SHAPE = (137, 151)
+
+
+def recorded(smear):
+    return simulate(
+        "histology",
+        shape=SHAPE,
+        frames=14,
+        channels=1,
+        physics="core",
+        pitch=4.7,
+        seed=4,
+        camera=Camera(photons=8000, bits=10, exposure=0.8),
+        faults=Faults(smear=smear),
+    )
+
+
+def found(burst, monkeypatch):
+    """Return the reconstruction of a burst, and what was found of its smear."""
+    kept: list[Scene] = []
+
+    def keep(*args, **kwargs):
+        kept.append(args[3])
+        return diagnose(*args, **kwargs)
+
+    monkeypatch.setattr("napari_fiberburst.pipeline.spline.diagnose", keep)
+    return reconstruct(burst), kept[0].smear
+
+
+def quality(result, simulated):
+    seen = np.isfinite(result.image)
+    return psnr(result.image[seen][None], simulated.truth[0, ..., 0][seen][None])
+
+
+@pytest.mark.parametrize("smear", [0.7, 1.0])
+def test_a_smear_is_found_and_its_blur_taken_out(smear, monkeypatch):
+    simulated = recorded(smear)
+    result, told = found(simulated.burst, monkeypatch)
+    assert told.part == pytest.approx(smear, abs=0.2)
+    assert any("while they were exposed" in note for note in result.notes)
+    monkeypatch.setattr("napari_fiberburst.scene.solve.find_smear", lambda *_: None)
+    assert quality(result, simulated) > quality(reconstruct(simulated.burst), simulated) + 0.3
+
+
+def test_frames_that_rest_while_they_are_exposed_are_left_alone(monkeypatch):
+    result, told = found(recorded(0.0).burst, monkeypatch)
+    assert told is None
+    assert not any("exposed" in note for note in result.notes)
+
+
+def test_equations_along_paths_see_the_mean_of_the_way():
+    """A scene is recovered from samples that are its means along straight ways of many lengths and directions."""
+    generator = torch.Generator().manual_seed(0)
+    grid = Grid(0.0, 0.0, 1.0, (41, 47))
+    truth = torch.sin(grid.nodes()[..., 0] / 2.1) * torch.cos(grid.nodes()[..., 1] / 2.7)
+    points = torch.rand(8, 1200, 2, generator=generator) * torch.tensor([38.0, 32.0]) + 4
+    steps = torch.randn(8, 1, 2, generator=generator).expand(8, 1200, 2) * 3
+    moments = torch.linspace(-0.5, 0.5, 41)
+    ways = points[:, :, None] + moments[:, None] * steps[:, :, None]
+    values = grid.at(ways)(truth).mean(dim=-1)
+    samples = _Plain(values[..., None], torch.ones(8, 1200))
+    errors = {}
+    for name, looks in (("along", Smear(1.0, steps).paths(points)), ("at the middle", points)):
+        scene = assemble(grid, samples, looks).solve(1e-4, iterations=300)[0]
+        errors[name] = float((scene - truth)[8:-8, 8:-8].square().mean().sqrt())
+    assert errors["along"] < 0.03
+    assert errors["along"] < errors["at the middle"] / 3
+
+
+class _Plain:
+    """As much of samples as is assembled."""
+
+    radius = None
+
+    def __init__(self, values, weights):
+        self.values, self.weights = values, weights
