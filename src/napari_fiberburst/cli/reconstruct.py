@@ -1,6 +1,7 @@
 """``fiberburst reconstruct``."""
 
 import argparse
+import math
 import signal
 import sys
 from collections.abc import Iterator
@@ -38,7 +39,8 @@ def add_to(commands: Any) -> None:
         "--output",
         type=Path,
         required=True,
-        help="image.ome.tif (its settings go into image.json beside it), or scene.npz for the fitted networks",
+        help="image.ome.tif (its settings go into image.json beside it), image.png for a quick look, or scene.npz for "
+        "the fitted networks",
     )
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
@@ -80,7 +82,8 @@ def run(options: argparse.Namespace) -> int:
 
         def show(report: Progress) -> None:
             bar.total = report.iterations
-            bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
+            if math.isfinite(report.loss):  # there is none while the bundle is calibrated
+                bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
             bar.update(report.step - bar.n)
 
         result = reconstruct(burst, **choices, bundle=known, control=control, on_progress=show)
