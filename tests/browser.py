@@ -48,6 +48,7 @@ async function look(page, width) {
   for (const part of words.querySelectorAll("pre, code, script, style, .katex")) part.remove();
   const asked = frame.contentWindow.performance.getEntriesByType("resource");
   return {
+    title: inside.title,
     elsewhere: asked.map(entry => entry.name).filter(name => !/^(blob|data):/.test(name) && !name.startsWith(origin)),
     refused: asked.filter(entry => entry.responseStatus >= 400).map(entry => entry.name),
     text: words.textContent,

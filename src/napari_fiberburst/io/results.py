@@ -96,7 +96,7 @@ def write_image(
         image, metadata["axes"] = np.moveaxis(image, 2, 0), "CYX"
         if acquisition.channel_names:
             metadata["Channel"] = {"Name": list(acquisition.channel_names)}
-    document = json.dumps({**_versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
+    document = json.dumps({**versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
     with write_whole(target) as stream, write_whole(sidecar_of(target)) as sidecar:
         tifffile.imwrite(stream, image, ome=True, photometric="minisblack", metadata=metadata)
         sidecar.write(document.encode())
@@ -106,7 +106,7 @@ def write_image(
 def write_representation(path: str | Path, arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Path:
     """Write named arrays and their provenance into one npz file."""
     target = check_output(path)
-    document = json.dumps({**_versions(), **provenance}, allow_nan=False, default=_plain)
+    document = json.dumps({**versions(), **provenance}, allow_nan=False, default=_plain)
     with write_whole(target) as stream:
         np.savez(stream, allow_pickle=False, provenance=np.array(document), **arrays)
     return target
@@ -141,7 +141,7 @@ def write_homographies(path: str | Path, homographies: NDArray[np.float64]) -> P
             {"frame": frame, "homography": matrix.tolist() if np.isfinite(matrix).all() else None}
             for frame, matrix in enumerate(homographies)
         ]
-        document = {**_versions(), "maps": "frame-t pixel (x, y) to frame-0 pixel (x, y)", "frames": frames}
+        document = {**versions(), "maps": "frame-t pixel (x, y) to frame-0 pixel (x, y)", "frames": frames}
         text = json.dumps(document, indent=1, allow_nan=False)
     else:
         raise OutputError(f"homographies are written to a file ending in .csv or .json; got {target}")
@@ -227,7 +227,8 @@ def _is_ours(path: Path) -> bool:
     return isinstance(told, dict) and told.get("software") == _SOFTWARE
 
 
-def _versions() -> dict[str, Any]:
+def versions() -> dict[str, Any]:
+    """Return what the result was made with: this software, Python, and the packages that decide its figures."""
     found = {"python": platform.python_version()}
     for name in _NAMED_PACKAGES:
         try:
