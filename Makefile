@@ -67,6 +67,7 @@ docs: .venv/docs
 docs-images: .venv/bench
 	cd docs/gallery && for name in read_the_evidence as_recorded where_it_fails; do \
 	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done
+	mkdir -p docs/gallery/stages && cd docs/gallery/stages && ../../../$(BIN)/python ../../../examples/draw_the_stages.py
 	for pair in first:your_first_burst trust:can_i_trust_it published:as_published; do \
 	  mkdir -p docs/tutorials/images/$${pair%:*} && cd docs/tutorials/images/$${pair%:*} \
 	  && ../../../../$(BIN)/python ../../../../examples/$${pair#*:}.py && rm -f *.tif *.json && cd ../../../.. || exit 1; done
