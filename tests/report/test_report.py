@@ -161,6 +161,7 @@ def test_places_that_cannot_be_written_are_refused_before_the_run(tmp_path, caps
 def test_numbers_on_axes_are_round():
     assert ticks(0, 1) == [0, 0.2, 0.4, 0.6, 0.8, 1]
     assert ticks(3, -0.1) == [0, 0.5, 1, 1.5, 2, 2.5, 3]
+    assert ticks(-0.7, 1.7, least=1) == [0, 1]
     assert [round_below(value) for value in (0.7, 1, 3, 49.9, 5000)] == [0.5, 1, 2, 20, 5000]
 
 

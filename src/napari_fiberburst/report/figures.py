@@ -35,6 +35,8 @@ class Chart:
         What they span.
     log_y : bool
         Whether the y axis is logarithmic.
+    whole_x : bool
+        Whether x counts something, such as frames, so that there is nothing between two of its whole numbers.
     """
 
     def __init__(
@@ -46,8 +48,9 @@ class Chart:
         y_range: tuple[float, float],
         *,
         log_y: bool = False,
+        whole_x: bool = False,
     ) -> None:
-        self._title, self._log_y = title, log_y
+        self._title, self._log_y, self._whole_x = title, log_y, whole_x
         self._x_range = x_range
         self._y_range = (math.log10(y_range[0]), math.log10(y_range[1])) if log_y else y_range
         self._parts: list[str] = []
@@ -113,7 +116,7 @@ class Chart:
 
     def _draw_axes(self, x_label: str, y_label: str) -> None:
         floor = _HEIGHT - _BOTTOM
-        for value in ticks(*self._x_range):
+        for value in ticks(*self._x_range, least=1 if self._whole_x else 0):
             at = self._x(value)
             self._parts.append(f'<path class="grid" d="M{at:.1f} {_TOP}V{floor}"/>')
             self._parts.append(f'<text x="{at:.1f}" y="{floor + 15}" text-anchor="middle">{value:g}</text>')
@@ -202,10 +205,10 @@ def path_of(points: NDArray[np.float64], frames: Iterable[int], unit: str) -> st
     return chart.svg()
 
 
-def ticks(low: float, high: float) -> list[float]:
-    """Return four to ten round numbers from `low` to `high`, whichever is the larger."""
+def ticks(low: float, high: float, least: float = 0) -> list[float]:
+    """Return four to ten round numbers from `low` to `high`, whichever is the larger, at least `least` apart."""
     low, high = min(low, high), max(low, high)
-    step = round_below((high - low) / 4)
+    step = max(round_below((high - low) / 4), least)
     first = math.ceil(low / step - 1e-9)
     return [float(f"{step * number:.12g}") + 0.0 for number in range(first, math.floor(high / step + 1e-9) + 1)]
 

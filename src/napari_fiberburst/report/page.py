@@ -181,7 +181,7 @@ def _residuals(result: Reconstruction) -> str:
         return _missing(told, "what the model misses is not known for this method")
     frames = _root_mean_square(result.residuals, axis=1)
     most = float(np.nanmax(frames)) if np.isfinite(frames).any() else 1.0
-    chart = Chart(told, "frame", "intensity", (-0.7, len(frames) - 0.3), (0, max(most * 1.1, 1e-9)))
+    chart = Chart(told, "frame", "intensity", (-0.7, len(frames) - 0.3), (0, max(most * 1.1, 1e-9)), whole_x=True)
     chart.bars(frames, [f"frame {frame}: {value:.3g}" for frame, value in enumerate(frames)])
     return _figure(chart.svg(), told, "what the image, seen through the bundle, leaves; none where one was left out")
 
@@ -204,7 +204,9 @@ def _errors(result: Reconstruction) -> str:
     if known.size == 0:
         return _missing(told, "nothing was fitted")
     low, high = float(known.min()), float(known.max())
-    chart = Chart(told, "step", "mean squared error", (0, len(losses)), (low / 1.3, high * 1.3), log_y=True)
+    chart = Chart(
+        told, "step", "mean squared error", (0, len(losses)), (low / 1.3, high * 1.3), log_y=True, whole_x=True
+    )
     chart.line(np.arange(1, len(losses) + 1), losses)
     return _figure(chart.svg(), told, "with intensities from -1 to 1; it begins once there is something to compare")
 
