@@ -65,10 +65,12 @@ docs: .venv/docs
 # What the site shows of the examples, and of the latest `make bench`. Rows that were not measured anew stay; only some
 # tables: make docs-results MORE="--tables 1 2"
 docs-images: .venv/bench
-	mkdir -p docs/gallery
-	cd docs/gallery && for name in reconstruct_a_burst read_the_evidence as_recorded where_it_fails; do \
+	cd docs/gallery && for name in read_the_evidence as_recorded where_it_fails; do \
 	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done
-	cd docs/gallery && rm -f cat.ome.tif cat.json
+	mkdir -p docs/gallery/stages && cd docs/gallery/stages && ../../../$(BIN)/python ../../../examples/draw_the_stages.py
+	for pair in first:your_first_burst trust:can_i_trust_it published:as_published; do \
+	  mkdir -p docs/tutorials/images/$${pair%:*} && cd docs/tutorials/images/$${pair%:*} \
+	  && ../../../../$(BIN)/python ../../../../examples/$${pair#*:}.py && rm -f *.tif *.json && cd ../../../.. || exit 1; done
 
 docs-results: .venv/bench
 	$(BIN)/python -m benchmarks.publish docs/results $(MORE)

@@ -34,6 +34,12 @@ X11_PACKAGES = {
     "libxcb-xkb.so.1": "libxcb-xkb1",
     "libxkbcommon-x11.so.0": "libxkbcommon-x11-0",
 }
+# What opens the documentation's pages, and reports, without a window: Chromium or its kin.
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
+_ELSEWHERE = (
+    "/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",
+    "C:/Program Files/Google/Chrome/Application/chrome.exe",
+)
 
 
 def advice(error: ImportError) -> str:
@@ -69,6 +75,12 @@ def missing_for_windows() -> list[str]:
     return missing
 
 
+def find_browser() -> str | None:
+    """Return the browser that opens pages in the tests; None where there is none."""
+    found = [path for name in BROWSERS if (path := shutil.which(name))]
+    return next(iter([*found, *(path for path in _ELSEWHERE if os.path.exists(path))]), None)
+
+
 def main() -> int:
     """Load everything; return 1 with advice where something does not load."""
     for name in modules():
@@ -82,6 +94,12 @@ def main() -> int:
         sys.stderr.write(
             "the plugin's tests open windows, and lack what those need;\n"
             f"on Debian or Ubuntu: sudo apt-get install {' '.join(missing)}\n"
+        )
+        return 1
+    if find_browser() is None:
+        sys.stderr.write(
+            "the tests of the documentation and of reports open pages in Chromium or Chrome, and there is neither;\n"
+            "on Debian: sudo apt-get install chromium\n"
         )
         return 1
     return 0

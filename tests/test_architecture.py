@@ -23,18 +23,20 @@ ALLOWED = {
     "io": BASE,
     "simulation": BASE,
     "quality": BASE,
-    "results": BASE | {"io", "bundle", "coordinates"},
+    "results": BASE | {"io", "bundle", "coordinates", "quality"},
     "operators": BASE | {"coordinates"},
     "bundle": BASE | {"coordinates", "operators", "device", "steps", "stored", "io"},
     "motion": BASE | {"coordinates", "operators", "steps", "stored", "bundle"},
     "scene": BASE | {"coordinates", "operators", "steps", "stored", "bundle", "motion", "quality"},
-    "networks": RESULTS | {"coordinates", "operators", "device", *STEPS},
+    "networks": RESULTS | {"coordinates", "operators", "device", "quality", *STEPS},
     "pipeline": RESULTS | {"coordinates", "operators", "device", "steps", "networks", *STEPS},
-    "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", ""},
+    "report": RESULTS | {"coordinates", "quality"},
+    "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", "report", ""},
     "memory": BASE,
     "streaming": set(),
     "plugin": RESULTS
-    | {"simulation", "quality", "coordinates", "bundle", "networks", "device", "pipeline", "memory", "streaming"},
+    | {"simulation", "quality", "coordinates", "bundle", "networks", "device", "pipeline", "report"}
+    | {"memory", "streaming"},
 }
 TORCH = {"stored", "device", "operators", "bundle", "motion", "scene", "networks", "pipeline"}
 QT = {"qtpy", "magicgui", "superqt", "napari", "pyqtgraph"}

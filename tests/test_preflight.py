@@ -17,7 +17,13 @@ def test_an_unknown_library_says_how_to_find_it():
 
 def test_ci_installs_all_that_is_named():
     listed = set(Path(__file__).parents[1].joinpath(".ci/apt-packages").read_text().split())
-    assert set(PREFLIGHT["X11_PACKAGES"].values()) <= listed
+    assert {*PREFLIGHT["X11_PACKAGES"].values(), "chromium"} <= listed
+
+
+def test_a_missing_browser_is_named(monkeypatch, capsys):
+    monkeypatch.setitem(PREFLIGHT["main"].__globals__, "find_browser", lambda: None)
+    assert PREFLIGHT["main"]() == 1
+    assert "sudo apt-get install chromium" in capsys.readouterr().err
 
 
 def test_all_loads_here():

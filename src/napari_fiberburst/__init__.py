@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.pipeline.remeasure import flatten as flatten
     from napari_fiberburst.pipeline.remeasure import remeasure as remeasure
     from napari_fiberburst.pipeline.render import render as render
+    from napari_fiberburst.report import write_report as write_report
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
     from napari_fiberburst.results.progress import Progress as Progress
     from napari_fiberburst.results.reconstruction import Reconstruction as Reconstruction
@@ -62,6 +63,7 @@ _HOMES = {
     "render": "pipeline.render",
     "sample": "bundle.samples",
     "solve": "scene.solve",
+    "write_report": "report",
 }
 
 _MODULES = ("quality", "settings", "simulation")

@@ -6,12 +6,15 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
+from tqdm import tqdm
 
-from napari_fiberburst.cli import demo, main
+from napari_fiberburst.cli import demo, main, reconstruct
 from napari_fiberburst.simulation import Faults, simulate
 
 SMALL = ["--preset", "paper", "--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
@@ -101,6 +104,23 @@ def test_reconstruct_takes_a_crop_and_settings_by_name(burst_file, tmp_path):
     assert told["burst"]["origin"] == [5, 10]
     assert told["settings"]["method"]["encoding"] == {"name": "nerf", "highest_octave": 3}
     assert told["seed"] == 7
+
+
+def test_reconstruct_writes_a_picture_for_a_quick_look(burst_file, tmp_path):
+    out = tmp_path / "look.png"
+    assert main(["reconstruct", str(burst_file), "-o", str(out), "--iterations", "5", *SMALL]) == 0
+    with Image.open(out) as picture:
+        assert (picture.mode, picture.size) == ("RGB", (41, 33))
+        assert np.asarray(picture).max() == 255
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["burst.npz", "look.png"]
+
+
+def test_no_loss_is_shown_before_there_is_one(burst_file, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(reconstruct, "tqdm", partial(tqdm, mininterval=0))
+    assert main(["reconstruct", str(burst_file), "-o", str(tmp_path / "a.png"), "--device", "cpu"]) == 0
+    shown = capsys.readouterr().err
+    assert "loss=" in shown
+    assert "nan" not in shown
 
 
 def test_reconstruct_can_write_the_networks(burst_file, tmp_path):

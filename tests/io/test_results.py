@@ -105,6 +105,14 @@ def test_the_source_of_a_result_is_not_replaced(tmp_path):
         check_output(tmp_path / "burst.tif", source=tmp_path / "burst.tif")
 
 
+@pytest.mark.parametrize("source", ["frames", "frames/*.png"])
+def test_a_result_does_not_become_a_frame_of_its_burst(tmp_path, source):
+    (tmp_path / "frames").mkdir()
+    with pytest.raises(OutputError, match="would be read as a frame"):
+        check_output(tmp_path / "frames" / "image.png", source=tmp_path / source)
+    check_output(tmp_path / "image.png", source=tmp_path / source)
+
+
 def test_an_image_and_its_provenance_appear_together_or_not_at_all(fit, tiny_burst, tmp_path, monkeypatch):
     result = fit(tiny_burst)
     synced = []

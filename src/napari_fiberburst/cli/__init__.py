@@ -17,7 +17,8 @@ TERMINATED = 143
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status: 0, 2 for input it cannot use, 130 when interrupted."""
     logging.basicConfig(format="fiberburst: %(message)s", level=logging.WARNING)
-    options = _parser().parse_args(arguments)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    options = _parser().parse_args(words, argparse.Namespace(words=words))
     # A run that is told to end, as by a batch queue, takes its half-written files with it.
     before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED))
     try:

@@ -1,7 +1,6 @@
 """``fiberburst demo``: a burst, its reconstruction, and how far it gets, in seconds."""
 
 import argparse
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,8 @@ from tqdm import tqdm
 
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import check_place, write_whole
+from napari_fiberburst.io.picture import write_png
+from napari_fiberburst.io.results import check_place
 from napari_fiberburst.quality import match_levels, motion_error, psnr, ssim
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.simulation import simulate
@@ -57,9 +57,7 @@ def run(options: argparse.Namespace) -> int:
     error = motion_error(result.homographies, simulated.homographies, shape)
     still = motion_error(np.broadcast_to(np.eye(3), (len(simulated.truth), 3, 3)), simulated.homographies, shape)
     print(f"motion off by {error:.2f} px on average; unregistered {still:.2f} px")
-    sheet = _side_by_side({**images, "truth": truth}, truth)
-    with write_whole(options.output) as stream:
-        stream.write(sheet)
+    write_png(options.output, _side_by_side({**images, "truth": truth}, truth))
     print(f"samples left out are met to {result.held_out_rmse:.2f} of 255; resolution {result.resolution:.1f} px")
     print(f"{result.seconds:.1f} s on {result.device}; wrote {options.output}")
     return 0
@@ -85,8 +83,8 @@ def _best_gaussian(captured: NDArray[np.float32], truth: NDArray[np.float32]) ->
     return max(filtered, key=lambda image: psnr(image, truth))
 
 
-def _side_by_side(images: dict[str, NDArray[np.float32]], truth: NDArray[np.float32]) -> bytes:
-    """Return a PNG of the images with their captions, all at the truth's levels but the captured one."""
+def _side_by_side(images: dict[str, NDArray[np.float32]], truth: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a sheet of the images with their captions, all at the truth's levels but the captured one."""
     height, width = truth.shape[:2]
     sheet = Image.new("RGB", (len(images) * (width + 8) - 8, height + _CAPTION_HEIGHT), "white")
     draw = ImageDraw.Draw(sheet)
@@ -99,6 +97,4 @@ def _side_by_side(images: dict[str, NDArray[np.float32]], truth: NDArray[np.floa
         draw.text((x + 2, 1), name, fill="black", font=font)
         if name != "truth":
             draw.text((x + 2, 16), f"{psnr(image, truth):.1f} dB / {ssim(image, truth):.2f}", fill="black", font=font)
-    encoded = BytesIO()
-    sheet.save(encoded, format="PNG")
-    return encoded.getvalue()
+    return np.asarray(sheet)

@@ -1,16 +1,15 @@
 """``fiberburst info``."""
 
 import argparse
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
 
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io import read_burst
-from napari_fiberburst.io.results import check_place, write_whole
+from napari_fiberburst.io.picture import write_png
+from napari_fiberburst.io.results import check_place
 
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
@@ -91,9 +90,6 @@ def _of_bundle(path: Path, output: Path | None) -> int:
     bundle = Bundle.load(path)
     describe(bundle)
     if output is not None:
-        encoded = BytesIO()
-        Image.fromarray(bundle.to_image()).save(encoded, format="PNG")
-        with write_whole(output) as stream:
-            stream.write(encoded.getvalue())
+        write_png(output, bundle.to_image())
         print(f"wrote {output}")
     return 0

@@ -1,6 +1,8 @@
 """``fiberburst reconstruct``."""
 
 import argparse
+import math
+import shlex
 import signal
 import sys
 from collections.abc import Iterator
@@ -13,9 +15,10 @@ from tqdm import tqdm
 
 from napari_fiberburst.cli.arguments import add_settings, parse_crop, settings_of
 from napari_fiberburst.control import Control
-from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.results import check_output
+from napari_fiberburst.report import check_report, write_report
 from napari_fiberburst.settings import PublishedMethod, Settings, choose
 
 if TYPE_CHECKING:
@@ -37,9 +40,10 @@ def add_to(commands: Any) -> None:
         "-o",
         "--output",
         type=Path,
-        required=True,
-        help="image.ome.tif (its settings go into image.json beside it), or scene.npz for the fitted networks",
+        help="image.ome.tif (its settings go into image.json beside it), image.png for a quick look, or scene.npz for "
+        "the fitted networks",
     )
+    parser.add_argument("--report", type=Path, help="report.html, with all that is known of the image, in one file")
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.add_argument("--black-level", type=float, help="intensity that stands for no light")
@@ -59,7 +63,12 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, fit, write. Returns 130 where the fit was interrupted, though its image was written."""
-    check_output(options.output, options.input)
+    if options.output is None and options.report is None:
+        raise OutputError("expected somewhere to write to; add -o image.ome.tif, --report report.html, or both")
+    if options.output is not None:
+        check_output(options.output, options.input)
+    if options.report is not None:
+        check_report(options.report)
     choices = settings_of(options)
     settings = choose(**choices)
     _check(options, settings)
@@ -80,11 +89,16 @@ def run(options: argparse.Namespace) -> int:
 
         def show(report: Progress) -> None:
             bar.total = report.iterations
-            bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
+            if math.isfinite(report.loss):  # there is none while the bundle is calibrated
+                bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
             bar.update(report.step - bar.n)
 
         result = reconstruct(burst, **choices, bundle=known, control=control, on_progress=show)
-        result.save(options.output)
+        if options.output is not None:
+            result.save(options.output)
+        if options.report is not None:
+            call = shlex.join(["fiberburst", *options.words])
+            write_report(result, burst, options.report, name=options.input.name, call=call)
     steps = len(result.losses)
     rate = steps / result.seconds
     print(f"{result.ending} after {steps} steps in {result.seconds:.1f} s on {result.device}, {rate:.1f} it/s")
@@ -98,7 +112,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     if result.quality is not None:
         print(f"the image is {result.quality}{'' if result.quality == 'good' else ': ' + '; '.join(result.notes)}")
-    print(f"wrote {options.output}")
+    print(f"wrote {' and '.join(str(path) for path in (options.output, options.report) if path is not None)}")
     if options.keep_bundle is not None:
         _keep(options.keep_bundle, result, known)
     return INTERRUPTED if result.ending == "stopped" else 0

@@ -8,6 +8,7 @@ import os
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from glob import has_magic
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from secrets import token_hex
@@ -22,6 +23,7 @@ from napari_fiberburst.errors import OutputError
 
 IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 REPRESENTATION_ENDING = ".npz"
+PICTURE_ENDING = ".png"
 # Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
 _OME_UNITS = ("pm", "Å", "nm", "µm", "mm", "cm", "m", "in", "pixel")
 _SOFTWARE = "napari-fiberburst"
@@ -42,17 +44,19 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
     ------
     OutputError
         The ending is unknown; the folder does not exist or cannot be written; the file, or the JSON beside it, is
-        the source or no result of ours.
+        the source or no result of ours, or would be taken for one of the source's frames.
     """
     target = Path(path)
-    endings = (*IMAGE_ENDINGS, REPRESENTATION_ENDING)
+    endings = (*IMAGE_ENDINGS, REPRESENTATION_ENDING, PICTURE_ENDING)
     if not target.name.lower().endswith(endings):
         raise OutputError(f"a result is written to a file ending in {', '.join(endings)}; got {target}")
-    files = [target] if is_representation(target) else [target, sidecar_of(target)]
+    files = [target] if is_representation(target) or is_picture(target) else [target, sidecar_of(target)]
     for file in files:
         check_place(file)
         if source is not None and file.exists() and source.exists() and file.samefile(source):
             raise OutputError(f"{file} is what the result is made from, and would be lost; choose another name")
+    if source is not None and _is_among(target, source):
+        raise OutputError(f"{target} would be read as a frame of {source} from then on; choose another folder")
     if len(files) == 2 and files[1].exists() and not _is_ours(files[1]):
         raise OutputError(
             f"{files[1]} is not of napari-fiberburst, and would be lost; choose another name for {target}"
@@ -63,6 +67,11 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
 def is_representation(path: Path) -> bool:
     """Whether a path names the fitted networks rather than an image."""
     return path.name.lower().endswith(REPRESENTATION_ENDING)
+
+
+def is_picture(path: Path) -> bool:
+    """Whether a path names a picture to look at, without the provenance that an image has."""
+    return path.name.lower().endswith(PICTURE_ENDING)
 
 
 def sidecar_of(path: Path) -> Path:
@@ -87,7 +96,7 @@ def write_image(
         image, metadata["axes"] = np.moveaxis(image, 2, 0), "CYX"
         if acquisition.channel_names:
             metadata["Channel"] = {"Name": list(acquisition.channel_names)}
-    document = json.dumps({**_versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
+    document = json.dumps({**versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
     with write_whole(target) as stream, write_whole(sidecar_of(target)) as sidecar:
         tifffile.imwrite(stream, image, ome=True, photometric="minisblack", metadata=metadata)
         sidecar.write(document.encode())
@@ -97,7 +106,7 @@ def write_image(
 def write_representation(path: str | Path, arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Path:
     """Write named arrays and their provenance into one npz file."""
     target = check_output(path)
-    document = json.dumps({**_versions(), **provenance}, allow_nan=False, default=_plain)
+    document = json.dumps({**versions(), **provenance}, allow_nan=False, default=_plain)
     with write_whole(target) as stream:
         np.savez(stream, allow_pickle=False, provenance=np.array(document), **arrays)
     return target
@@ -132,7 +141,7 @@ def write_homographies(path: str | Path, homographies: NDArray[np.float64]) -> P
             {"frame": frame, "homography": matrix.tolist() if np.isfinite(matrix).all() else None}
             for frame, matrix in enumerate(homographies)
         ]
-        document = {**_versions(), "maps": "frame-t pixel (x, y) to frame-0 pixel (x, y)", "frames": frames}
+        document = {**versions(), "maps": "frame-t pixel (x, y) to frame-0 pixel (x, y)", "frames": frames}
         text = json.dumps(document, indent=1, allow_nan=False)
     else:
         raise OutputError(f"homographies are written to a file ending in .csv or .json; got {target}")
@@ -202,6 +211,14 @@ def check_place(path: Path) -> None:
         raise OutputError(f"{path} cannot be written ({error}); choose another place") from error
 
 
+def _is_among(target: Path, source: Path) -> bool:
+    """Whether a file would lie in the folder, or match the pattern, that a burst is read from."""
+    if source.is_dir():
+        return target.parent.samefile(source)
+    parent = source.parent
+    return parent.is_dir() and target.parent.samefile(parent) and has_magic(source.name) and target.match(source.name)
+
+
 def _is_ours(path: Path) -> bool:
     try:
         told = json.loads(path.read_bytes())
@@ -210,7 +227,8 @@ def _is_ours(path: Path) -> bool:
     return isinstance(told, dict) and told.get("software") == _SOFTWARE
 
 
-def _versions() -> dict[str, Any]:
+def versions() -> dict[str, Any]:
+    """Return what the result was made with: this software, Python, and the packages that decide its figures."""
     found = {"python": platform.python_version()}
     for name in _NAMED_PACKAGES:
         try:

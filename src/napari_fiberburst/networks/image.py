@@ -16,6 +16,7 @@ from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError, OutputError
 from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.networks.field import JointField
+from napari_fiberburst.quality.resolution import RingCorrelation
 from napari_fiberburst.results.reconstruction import Reconstruction, draw
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import NetworkMethod, Settings, SplineMethod, TrainedMethod
@@ -185,6 +186,7 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         misfit=provenance.get("misfit"),
         exposures=_per_frame(provenance, "exposures"),
         resolution=provenance.get("resolution"),
+        agreement=_agreement(provenance),
         notes=tuple(provenance.get("notes", ())),
     )
 
@@ -193,6 +195,16 @@ def _per_frame(provenance: dict[str, Any], name: str) -> NDArray[np.float64] | N
     """Return one number a frame, NaN where the file has none; None where it does not know them."""
     values = provenance.get(name)
     return None if values is None else np.array(values, dtype=np.float64)
+
+
+def _agreement(provenance: dict[str, Any]) -> RingCorrelation | None:
+    told, resolution = provenance.get("agreement"), provenance.get("resolution")
+    if told is None:
+        return None
+    frequency, correlation = (_per_frame(told, name) for name in ("frequency", "correlation"))
+    assert frequency is not None
+    assert correlation is not None
+    return RingCorrelation(frequency, correlation, np.nan if resolution is None else resolution)
 
 
 def _rebuild_networks(

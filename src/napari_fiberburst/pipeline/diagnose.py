@@ -106,6 +106,7 @@ def diagnose(
         residuals=(residuals * span).cpu().numpy().astype(np.float32),
         held_out_rmse=None if scene.held_out_rmse is None else scene.held_out_rmse * span,
         resolution=scene.resolution,
+        agreement=scene.agreement,
     )
 
 

@@ -56,6 +56,10 @@ class RingCorrelation:
     correlation: NDArray[np.float64]
     resolution: float
 
+    def in_pixels(self, size: float) -> "RingCorrelation":
+        """Return the same in pixels of another size, of which one of the images' takes `size`."""
+        return RingCorrelation(self.frequency / size, self.correlation, self.resolution * size)
+
 
 def ring_correlation(
     first: NDArray[np.floating], second: NDArray[np.floating], weight: NDArray[np.floating] | None = None

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.quality.resolution import RingCorrelation
 
 Quality = Literal["good", "doubtful", "bad"]
 
@@ -58,6 +59,8 @@ class Diagnostics:
         The frame in whose pixels image and homographies are: 0, unless that frame could not be used.
     resolution : float or None
         Frame pixels, the finest period on which two halves of the burst agree (Fourier ring correlation of 1/7).
+    agreement : RingCorrelation or None
+        Of two halves of the burst, frequency by frequency, in frame pixels: what `resolution` was read from.
     notes : tuple of str
         What a user should know before trusting the image.
     """
@@ -78,6 +81,7 @@ class Diagnostics:
     confidence: NDArray[np.float64] | None = None
     reference: int = 0
     resolution: float | None = None
+    agreement: RingCorrelation | None = None
     notes: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
@@ -93,6 +97,9 @@ class Diagnostics:
             "exposures": _plain(self.exposures),
             "reference": self.reference,
             "resolution": self.resolution,
+            "agreement": None
+            if self.agreement is None
+            else {name: _plain(getattr(self.agreement, name)) for name in ("frequency", "correlation")},
             "notes": self.notes,
             "bundle": None
             if bundle is None

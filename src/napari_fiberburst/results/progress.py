@@ -20,7 +20,8 @@ class Progress:
     iterations : int
         Steps this run will do if nothing stops it.
     loss : float
-        Latest mean squared error over the step's samples, intensities in [-1, 1], and the motion's prior if any.
+        Latest mean squared error over the step's samples, intensities in [-1, 1], and the motion's prior if any; NaN
+        while the bundle is calibrated, before anything is fitted.
     seconds : float
         Time since the run began its steps, pauses left out.
     rate : float

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.io.results import is_representation, write_image, write_representation
+from napari_fiberburst.io.picture import as_picture, write_png
+from napari_fiberburst.io.results import (
+    check_output,
+    is_picture,
+    is_representation,
+    write_image,
+    write_representation,
+)
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.settings import Settings
 
@@ -232,13 +239,14 @@ class Reconstruction(Diagnostics):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the image, or the fitted networks themselves.
+        """Write the image, a picture of it, or the fitted networks themselves.
 
         Parameters
         ----------
         path : str or Path
             ``.ome.tif`` (or ``.tif``): the image as OME-TIFF with pixel size and channel names, and its
-            provenance as JSON beside it. ``.npz``: the compressed representation, which
+            provenance as JSON beside it. ``.png``: a picture to look at, 8 bits, from the darkest to the brightest
+            thousandth, see-through where the image is NaN. ``.npz``: the compressed representation, which
             `napari_fiberburst.load` reads back to be rendered at any size or continued (without Adam's moments).
 
         Returns
@@ -254,6 +262,8 @@ class Reconstruction(Diagnostics):
         """
         if is_representation(Path(path)):
             return write_representation(path, self.renderer.arrays(), self.provenance())
+        if is_picture(Path(path)):
+            return write_png(check_output(path), as_picture(self.image))
         return write_image(path, self.image, self.acquisition, self.provenance())
 
     @property

@@ -1,6 +1,5 @@
 """How smooth the scene should be, chosen by what one part of the burst tells of another."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
-from napari_fiberburst.quality.resolution import RingSpectra, correlation_of, ring_spectra
+from napari_fiberburst.quality.resolution import RingCorrelation, RingSpectra, correlation_of, ring_spectra
 from napari_fiberburst.scene.prediction import misfit
 from napari_fiberburst.scene.spline import assemble
 from napari_fiberburst.scene.window import liveliest
@@ -37,18 +36,18 @@ _FOLDS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Smoothness:
-    """How smooth the scene should be, and what resolution that gives.
+    """How smooth the scene should be, and down to what detail halves of the burst agree.
 
     Attributes
     ----------
     weight : float
         lambda.
-    resolution : float or None
-        Pixels, the finest period on which two halves of the burst agree; None where that could not be told.
+    agreement : RingCorrelation or None
+        Of two halves of the burst, in frame pixels; None where that could not be told.
     """
 
     weight: float
-    resolution: float | None
+    agreement: RingCorrelation | None
 
 
 def choose_smoothness(
@@ -85,9 +84,8 @@ def choose_smoothness(
     spectra = ring_spectra(first, second, soft)
     density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in halves]))
     errors = _expected_error(spectra, *halves[0].responses(spectra.frequency), density, _ROUGH)
-    resolution = window.spacing * correlation_of(spectra).resolution
     weight = float(_CANDIDATES[np.argmin(errors)]) if np.isfinite(errors).all() else UNTOLD
-    return Smoothness(weight, resolution if math.isfinite(resolution) else None)
+    return Smoothness(weight, correlation_of(spectra).in_pixels(window.spacing))
 
 
 def _expected_error(

@@ -13,6 +13,7 @@ from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.quality.resolution import RingCorrelation
 from napari_fiberburst.scene.gains import GainChange, refine_gains
 from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.prediction import misfit
@@ -54,8 +55,8 @@ class Scene(Stored):
         How the frames moved while they were exposed; None where that was not seen.
     is_draft : bool
         Whether its smoothness is a usual one that has not been chosen yet.
-    resolution : float or None
-        Pixels, the finest period on which two halves of the burst agree; None where that is not known.
+    agreement : RingCorrelation or None
+        Of two halves of the burst, frequency by frequency, in frame pixels; None where that is not known.
     held_out_rmse : float or None
         Root mean square error, full scale 1, of samples left out of the fit, before they were taken in.
     """
@@ -70,8 +71,15 @@ class Scene(Stored):
     outliers: Tensor | None = None
     smear: Smear | None = None
     is_draft: bool = True
-    resolution: float | None = None
+    agreement: RingCorrelation | None = None
     held_out_rmse: float | None = None
+
+    @property
+    def resolution(self) -> float | None:
+        """Pixels, the finest period on which two halves of the burst agree; None where that is not known."""
+        if self.agreement is None or not math.isfinite(self.agreement.resolution):
+            return None
+        return self.agreement.resolution
 
     @property
     def grid(self) -> Grid:
@@ -181,7 +189,7 @@ def solving(
         points = scene.looks(points)
     yield scene
     chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
-    scene = replace(scene, resolution=chosen.resolution)
+    scene = replace(scene, agreement=chosen.agreement)
     yield scene
     left_out = _left_out(samples, held_out, seed)
     equations = assemble(grid, samples, points, (~left_out).to(points))
