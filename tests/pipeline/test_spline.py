@@ -93,7 +93,7 @@ def test_the_same_call_twice_gives_the_same_bits(cores, fitted):
     "faults",
     [
         Faults(),
-        Faults(deformation=3.0, flicker=0.05, intruder=0.05),
+        Faults(deformation=3.0, flicker=0.05, intruder=0.05, smear=1.0),
         Faults(vignette=3.0, field=0.9, overlay=True, bundle_shift=1.0),
     ],
 )
@@ -102,7 +102,7 @@ def test_the_same_bits_with_any_number_of_threads(faults, same):
     burst = simulate("histology", shape=(211, 243), frames=12, physics="core", pitch=4.6, faults=faults, seed=4).burst
     before, results = torch.get_num_threads(), []
     try:
-        for threads in (1, 2, 3):
+        for threads in (1, 2):
             torch.set_num_threads(threads)
             results.append(reconstruct(burst))
     finally:

@@ -172,7 +172,7 @@ def in_grey(frames: Tensor) -> Tensor:
 def exposed(frames: Tensor) -> Tensor:
     """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
     # One by one, because what this makes of a frame is as large as it is.
-    deviation = torch.stack([(frame - frame.mean()).square().mean().sqrt() for frame in frames])
+    deviation = torch.stack([steady.mean((frame - steady.mean(frame)).square()).sqrt() for frame in frames])
     bright = torch.stack([(frame >= SATURATED).sum() / frame.numel() for frame in frames])
     good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
     return good if bool(good.any()) else torch.ones_like(good)

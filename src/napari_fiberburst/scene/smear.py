@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.prediction import misfit, predict
 from napari_fiberburst.scene.spline import assemble
@@ -49,7 +50,7 @@ class Smear:
     @property
     def length(self) -> float:
         """How far samples moved, pixels (root mean square)."""
-        return self.part * float(self.steps.square().sum(dim=2).mean().sqrt())
+        return self.part * float(steady.mean(self.steps.square().sum(dim=2)).sqrt())
 
     def paths(self, points: Tensor) -> Tensor:
         """Return where samples looked that were at points (T, N, 2) in the middle, (T, N, K, 2)."""
@@ -113,8 +114,8 @@ def _score(samples: Samples, points: Tensor, grid: Grid, light: Tensor, way: Sme
     for part, smeared in zip(predict(samples, points, grid, light), along, strict=True):
         weights = torch.minimum(part.weights, smeared.weights)
         change = (smeared.light - part.light)[:, 0]
-        agreement += float((weights * change * (part.values - part.light)[:, 0]).sum())
-        power += float((weights * change**2).sum())
+        agreement += float(steady.total(weights * change * (part.values - part.light)[:, 0]))
+        power += float(steady.total(weights * change**2))
     return agreement / power if power > 0 else -np.inf
 
 
