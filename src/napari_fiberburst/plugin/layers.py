@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.plugin import METADATA_KEY
-from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
+from napari_fiberburst.plugin.placement import COLOUR_LIMITS, Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import Flow, bending, moved_points, residual_maps, stabilised
 
 if TYPE_CHECKING:
@@ -124,9 +124,10 @@ class RunLayers:
         if self._has_time:
             still = stabilised(frames, result.homographies, canvas, flow)
             if self.placement.rgb:
-                self._add("stabilised burst", still, "TYX", canvas, rgb=True)
+                self._add("stabilised burst", still, "TYX", canvas, rgb=True, contrast_limits=self.placement.limits[0])
             else:
-                self._add("stabilised burst", still, "TYXC"[: still.ndim], canvas, colormap=self.placement.colormaps[0])
+                look = {"colormap": self.placement.colormaps[0], "contrast_limits": self.placement.limits[0]}
+                self._add("stabilised burst", still, "TYXC"[: still.ndim], canvas, **look)
             yield
         self._add("coverage", result.coverage, "YX", canvas, colormap="viridis")
         yield
@@ -190,7 +191,8 @@ class RunLayers:
         return [("image", *self.placement.arrange(image, "YXC"[: image.ndim]))]
 
     def _add_image(self, kind: str, data: NDArray[np.float32], placed: dict[str, Any], colormap: Any) -> None:
-        more = {} if self.placement.rgb else {"colormap": colormap}
+        # Left to itself, napari takes the limits of the first image, which of a network is nearly even.
+        more: dict[str, Any] = {"contrast_limits": COLOUR_LIMITS} if self.placement.rgb else {"colormap": colormap}
         limits = limits_of(data)
         if limits is not None and not self.placement.rgb:
             more["contrast_limits"] = limits
