@@ -5,7 +5,9 @@ from napari.layers import Image
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
+from napari_fiberburst.plugin import dock as dock_module
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.plugin.preferences import Preferences
 from napari_fiberburst.plugin.stacks import stabilised
 from napari_fiberburst.simulation import Camera, Faults, simulate
 
@@ -151,6 +153,32 @@ def test_the_form_is_as_it_was_left(open_dock, burst_layer):
     again = FiberBurstWidget(viewer)
     assert again.form.choices() == {"motion": "affine", "upsample": 2.0}
     again.shut_down()
+
+
+def test_what_is_remembered_is_told_with_one_click_back(open_dock, burst_layer, grey_frames):
+    viewer, dock = open_dock(burst_layer)
+    assert dock.departures.isHidden()
+    dock.form.set_choices({"preset": "paper", "sigma": 2.0})
+    assert dock.departures.words.text() == "set: paper, sigma 2.0"
+    again = FiberBurstWidget(viewer)
+    assert not again.departures.isHidden()
+    assert again.departures.words.text() == "as last time: paper, sigma 2.0"
+    again.departures.back_button.click()
+    assert again.form.choices() == {}
+    assert again.departures.isHidden()
+    again.shut_down()
+    # Nor is it told less where the next burst comes in the same window.
+    dock.input.burst.value = viewer.add_layer(Image(grey_frames, name="next"))
+    assert dock.departures.words.text() == "as last time: paper, sigma 2.0"
+
+
+def test_a_preset_that_is_preferred_needs_no_word(open_dock, burst_layer, monkeypatch):
+    monkeypatch.setattr(dock_module, "preferences", lambda: Preferences(preset="paper"))
+    _, dock = open_dock(burst_layer)
+    assert dock.form.choices() == {"preset": "paper"}
+    assert dock.departures.isHidden()
+    dock.form.set_choices({"device": "cpu"})
+    assert dock.departures.words.text() == "set: auto, device cpu"
 
 
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):

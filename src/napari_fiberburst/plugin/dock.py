@@ -24,6 +24,7 @@ from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 from napari_fiberburst.plugin.calls import as_python
 from napari_fiberburst.plugin.copying import CopyButtons
+from napari_fiberburst.plugin.departures import Departures
 from napari_fiberburst.plugin.display import AnimationThrottle, Display
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
@@ -31,7 +32,7 @@ from napari_fiberburst.plugin.job import Job, load_solver
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.placement import Placement
-from napari_fiberburst.plugin.preferences import preferences, remember, remembered
+from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
 from napari_fiberburst.plugin.runner import Runner
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
 from napari_fiberburst.plugin.sections import row_of
@@ -76,12 +77,15 @@ class FiberBurstWidget(QWidget):
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
         self.copying = CopyButtons(self.input, self.form)
+        self.departures = Departures()
+        self._burst: Layer | None = None
         self._preferences = preferences()
         self.form.set_choices(remembered(self._preferences))
         self._lay_out()
         self._connect()
         self._follow_state("ready")
         self._estimate()
+        self.departures.begin_anew()
         self._warm_up()
 
     def start(self) -> None:
@@ -215,6 +219,7 @@ class FiberBurstWidget(QWidget):
         self.pause_button.setText("Continue" if state == "paused" else "Pause")
         self.stop_button.setEnabled(state in ("running", "paused"))
         self.input.set_enabled(is_ready)
+        self.departures.set_enabled(is_ready)
         self.form.set_running(not is_ready, is_network=self._is_network)
         self.runs.set_running(not is_ready)
         self.display.slider.setEnabled(is_ready)
@@ -247,11 +252,21 @@ class FiberBurstWidget(QWidget):
         run.turned_live.append((seconds, name, value))
         run.layers.tell("turned_live", list(run.turned_live))
 
+    def _take_input(self) -> None:
+        if self.input.burst.value is not self._burst:
+            self._burst = self.input.burst.value
+            self.departures.begin_anew()
+        self._estimate()
+
+    def _set_back(self) -> None:
+        self.form.set_choices(usual(self._preferences))
+
     def _estimate(self) -> None:
         """Say how much memory the run will take, and keep the choices."""
         self._memory.setText("")
         with suppress(FiberBurstError):
             choices = self.form.choices()
+            self.departures.take_choices(choices, usual(self._preferences))
             remember(choices, self._preferences)
             self._memory.setText(in_words(self.input.source(), choices, self._missing))
 
@@ -281,6 +296,7 @@ class FiberBurstWidget(QWidget):
         content = QWidget()
         column = QVBoxLayout(content)
         column.addWidget(self.input)
+        column.addWidget(self.departures)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
         column.addWidget(self.display.status_box)
         column.addWidget(self.form)
@@ -305,7 +321,8 @@ class FiberBurstWidget(QWidget):
         self.pause_button.clicked.connect(self._toggle_pause)
         self.stop_button.clicked.connect(self.runner.stop)
         self.copying.copied.connect(self.display.status.setText)
-        self.input.changed.connect(self._estimate)
+        self.input.changed.connect(self._take_input)
+        self.departures.back_asked.connect(self._set_back)
         self.form.changed.connect(self._estimate)
         self.form.turned_live.connect(self._turn_live)
         self.runs.chosen.connect(self.display.select)
