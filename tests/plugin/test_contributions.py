@@ -67,13 +67,30 @@ def test_a_faulty_sample_is_told_from_others_by_its_name_its_recipe_and_its_trut
     np.testing.assert_array_equal(again.arrays()["frames"], frames)
 
 
-def test_an_npz_burst_opens_with_its_truth(tmp_path, simulated):
-    path = tmp_path / "burst.npz"
-    np.savez(path, **simulated.arrays())
+@pytest.mark.parametrize("ending", [".burst", ".npz"])
+def test_a_simulated_burst_opens_with_its_truth(tmp_path, simulated, ending):
+    path = tmp_path / f"tissue{ending}"
+    with path.open("wb") as stream:
+        np.savez(stream, **simulated.arrays())
     ((frames, look, _),) = contributions.get_reader(str(path))(str(path))
     np.testing.assert_array_equal(frames, simulated.arrays()["frames"])
     assert look["rgb"]
     np.testing.assert_array_equal(look["metadata"]["fiberburst"]["homographies"], simulated.homographies)
+
+
+def test_a_simulated_burst_that_is_dropped_on_the_window_opens(make_napari_viewer, npe2pm, tmp_path, simulated):
+    """That of napari itself, which reads numpy's archives, must not be taken for it."""
+    npe2pm.register(MANIFEST)
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    path = tmp_path / "tissue.burst"
+    with path.open("wb") as stream:
+        np.savez(stream, **simulated.arrays())
+    viewer = make_napari_viewer()
+    viewer.open(str(path), plugin=None)
+    (layer,) = viewer.layers
+    assert layer.source.reader_plugin == "napari-fiberburst"
+    np.testing.assert_array_equal(layer.data, simulated.arrays()["frames"])
+    assert "truth" in layer.metadata["fiberburst"]
 
 
 def test_a_folder_of_frames_opens_as_a_stack(tmp_path, grey_frames):

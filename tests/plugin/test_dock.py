@@ -209,7 +209,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     dock.copying.command.click()
     command = QApplication.clipboard().text()
     assert command.splitlines()[-1] == (
-        "fiberburst reconstruct burst.npz -o image.ome.tif --motion affine --upsample 2.0"
+        "fiberburst reconstruct simulated.burst -o image.ome.tif --motion affine --upsample 2.0"
     )
 
 

@@ -115,12 +115,12 @@ def test_axes_region_and_channels_are_in_the_call():
 def test_a_simulated_burst_is_simulated_by_its_command():
     text = as_command(source(recipe={"scene": "cat", "physics": "core"}), {"preset": "paper"})
     assert text.splitlines() == [
-        "fiberburst simulate --scene cat --physics core -o burst.npz",
-        "fiberburst reconstruct burst.npz -o image.ome.tif --preset paper",
+        "fiberburst simulate --scene cat --physics core -o simulated.burst",
+        "fiberburst reconstruct simulated.burst -o image.ome.tif --preset paper",
     ]
     faulty = {"scene": "cat", "deformation_length": 40.0, "overlay": True}
     assert as_command(source(recipe=faulty), {}).startswith(
-        "fiberburst simulate --scene cat --deformation-length 40.0 --overlay -o burst.npz\n"
+        "fiberburst simulate --scene cat --deformation-length 40.0 --overlay -o simulated.burst\n"
     )
 
 

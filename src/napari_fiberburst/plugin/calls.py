@@ -45,7 +45,7 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSo
     path = source.path
     lines = []
     if path is None and source.recipe:
-        path = "burst.npz"
+        path = "simulated.burst"
         options = [word for name, value in source.recipe.items() for word in _option(name, value)]
         lines.append(shlex.join(["fiberburst", "simulate", *options, "-o", path]))
     elif path is None:
