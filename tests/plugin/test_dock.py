@@ -2,6 +2,7 @@
 
 import numpy as np
 from napari.layers import Image
+from pyqtgraph import PlotWidget
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
@@ -179,6 +180,30 @@ def test_a_preset_that_is_preferred_needs_no_word(open_dock, burst_layer, monkey
     assert dock.departures.isHidden()
     dock.form.set_choices({"device": "cpu"})
     assert dock.departures.words.text() == "set: auto, device cpu"
+
+
+def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock, run_through, burst_layer):
+    _, dock = open_dock(burst_layer)
+    dock.form.set_choices(QUICK)
+    first = run_through(dock)
+    dock.form.set_choices({**QUICK, "iterations": 4})
+    second = run_through(dock)
+
+    def drawn():
+        (plot,) = [
+            plot for plot in dock.display.curve_box.findChildren(PlotWidget) if plot.getAxis("left").labelText == "loss"
+        ]
+        seconds = plot.listDataItems()[0].getOriginalDataset()[0]
+        return [] if seconds is None else seconds
+
+    dock.display.curve_box.expand(animate=False)
+    np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])
+    dock.runs.list_of_runs.setCurrentRow(dock.runs.runs.index(first))
+    np.testing.assert_array_equal(drawn(), [point.seconds for point in first.curve if np.isfinite(point.loss)])
+    assert len(drawn()) > 0
+    dock.runs.remove(first)
+    dock.runs.remove(second)
+    assert len(drawn()) == 0
 
 
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):

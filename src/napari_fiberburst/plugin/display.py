@@ -53,7 +53,6 @@ class Display(QObject):
         self.curve_box = section("Curves", self._curves)
         self.status_box, self.past_box = self._lay_out()
         self._selected: KeptRun | None = None
-        self._points: tuple[Job, float] | None = None
         self._layers_to_come: Iterator[None] = iter(())
         self._timer = QTimer(self)
         self._timer.setInterval(0)
@@ -63,7 +62,6 @@ class Display(QObject):
 
     def begin(self) -> None:
         """Make way for a new run."""
-        self._curves.clear()
         # No moving bar for "busy": where the canvas is drawn in software, every repaint takes time from the fit.
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
@@ -82,7 +80,7 @@ class Display(QObject):
         if job.acquisition is None:
             return
         run.layers.show_frames(report.homographies, job.acquisition.shape[1:3])
-        self._points = job, job.acquisition.white_level - job.acquisition.black_level
+        run.span = job.acquisition.white_level - job.acquisition.black_level
         self._draw_curves()
         self.bar.setRange(0, report.iterations)
         self.bar.setValue(report.step)
@@ -96,7 +94,6 @@ class Display(QObject):
         run.result = result
         run.scores = next((point.scores for point in reversed(job.curve) if point.scores is not None), None)
         self._draw_curves()
-        self._points = None
         notes = f"; {len(result.notes)} notes, see Runs" if result.notes else ""
         self.status.setText(f"{run.name}: {_verdict(result.quality)}{result.ending} in {result.seconds:.1f} s{notes}")
         self._layers_to_come = chain(
@@ -106,16 +103,21 @@ class Display(QObject):
 
     def fail(self) -> None:
         """Say that a run came to nothing."""
-        self._points = None
         self.status.setText("The run failed. Change the settings or the burst, and press Start.")
 
     def select(self, run: KeptRun | None) -> None:
-        """Let the history be that of a run, at its newest image; one that was gone back through shows it again."""
+        """Let curves and history be those of a run, at its newest image.
+
+        One that was gone back through shows that image again.
+        """
         before = self._selected
         if before is not None and before.result is not None and self.slider.value() < self.slider.maximum():
             result = before.result
             before.layers.show_image(result.image, result.acquisition, result.canvas)
         self._selected = run
+        if run is not before:
+            self._curves.clear()
+            self._draw_curves()
         self.slider.blockSignals(True)
         self.slider.setMaximum(0 if run is None else max(0, len(run.history.entries) - 1))
         self.slider.setValue(self.slider.maximum())
@@ -156,9 +158,9 @@ class Display(QObject):
         yield
 
     def _draw_curves(self) -> None:
-        if self._points is not None and self.curve_box.isExpanded():
-            job, span = self._points
-            self._curves.show_points(job.curve, span)
+        run = self._selected
+        if run is not None and self.curve_box.isExpanded():
+            self._curves.show_points(run.curve, run.span)
 
     def _scrub(self, index: int) -> None:
         """Show an image of the past."""

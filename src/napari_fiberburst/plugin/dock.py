@@ -66,7 +66,6 @@ class FiberBurstWidget(QWidget):
         self._missing: dict[str, str] | None = None
         self._throttle = AnimationThrottle()
         self._is_network = False
-        self._wheel_filter = WheelFilter(self)
         self.input = InputBox(viewer)
         self.form = SettingsForm()
         self.runner = Runner(self)
@@ -165,7 +164,9 @@ class FiberBurstWidget(QWidget):
             bundle=None if bundle is None else bundle.given,
             initial=initial,
         )
-        self._run = KeptRun(name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle)
+        self._run = KeptRun(
+            name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle, curve=job.curve
+        )
         self._shown_at_end = "image"
         self.display.begin()
         self.runs.add(self._run)
@@ -306,12 +307,12 @@ class FiberBurstWidget(QWidget):
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
         column.addStretch(1)
-        self._wheel_filter.protect(content)
         scroll = QScrollArea()
         scroll.setWidgetResizable(True)
         scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         scroll.setFrameShape(QScrollArea.Shape.NoFrame)
         scroll.setWidget(content)
+        WheelFilter(scroll)
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addWidget(scroll)

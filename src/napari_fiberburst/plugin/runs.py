@@ -1,6 +1,6 @@
 """What is kept of each run: settings, result, time and layers; two of them side by side; and how they are saved."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,7 @@ from napari_fiberburst.io.results import write_homographies
 from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 from napari_fiberburst.plugin.history import History
-from napari_fiberburst.plugin.job import Scores
+from napari_fiberburst.plugin.job import CurvePoint, Scores
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.sections import row_of
 from napari_fiberburst.settings import SplineMethod
@@ -57,6 +57,10 @@ class KeptRun:
         In the viewer.
     history : History
         The images on the way.
+    curve : sequence of CurvePoint
+        How it went; grows at its end while it runs.
+    span : float
+        The camera's full scale, which errors on the curves are parts of.
     turned_live : list of (float, str, object)
         Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
@@ -72,6 +76,8 @@ class KeptRun:
     layers: RunLayers
     bundle: BundleSource | None = None
     history: History = field(default_factory=History)
+    curve: Sequence[CurvePoint] = ()
+    span: float = 1.0
     turned_live: list[tuple[float, str, Any]] = field(default_factory=list)
     result: "Reconstruction | None" = None
     scores: Scores | None = None
