@@ -1,5 +1,6 @@
 """The dock widget "Fiber burst reconstruction"."""
 
+import atexit
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -33,9 +34,9 @@ from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
-from napari_fiberburst.plugin.runner import Runner
+from napari_fiberburst.plugin.runner import Runner, wait_for_workers
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
-from napari_fiberburst.plugin.sections import row_of
+from napari_fiberburst.plugin.sections import row_of, section
 from napari_fiberburst.settings import SplineMethod, choose
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class FiberBurstWidget(QWidget):
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
+        self._scroll = QScrollArea()
         self.copying = CopyButtons(self.input, self.form)
         self.departures = Departures()
         self._burst: Layer | None = None
@@ -128,6 +130,13 @@ class FiberBurstWidget(QWidget):
     def sizeHint(self) -> QSize:
         """Ask for a narrow dock: the image is what matters."""
         return QSize(_WIDTH, super().sizeHint().height())
+
+    def minimumSizeHint(self) -> QSize:
+        """Ask for as much width as what is in the dock needs, which scrolls downwards alone: nothing is cut off."""
+        content, bar = self._scroll.widget(), self._scroll.verticalScrollBar()
+        if content is None or bar is None:
+            return super().minimumSizeHint()
+        return QSize(content.minimumSizeHint().width() + bar.sizeHint().width(), super().minimumSizeHint().height())
 
     def event(self, event: QEvent | None) -> bool:
         """Notice when the dock is closed for good: napari takes the widget out of it, and does not delete it."""
@@ -283,6 +292,7 @@ class FiberBurstWidget(QWidget):
 
         The worker is superqt's, because napari shows its own as activity and asks before it closes.
         """
+        atexit.register(wait_for_workers)
         create_worker(load_solver, _connect={"returned": self._take_missing}, _ignore_errors=True)
 
     def _take_missing(self, missing: dict[str, str]) -> None:
@@ -300,14 +310,12 @@ class FiberBurstWidget(QWidget):
         column.addWidget(self.departures)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
         column.addWidget(self.display.status_box)
-        column.addWidget(self.form)
-        column.addWidget(self._memory)
-        column.addWidget(self.copying)
+        column.addWidget(section("Settings", self._settings()))
         column.addWidget(self.display.curve_box)
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
         column.addStretch(1)
-        scroll = QScrollArea()
+        scroll = self._scroll
         scroll.setWidgetResizable(True)
         scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         scroll.setFrameShape(QScrollArea.Shape.NoFrame)
@@ -316,6 +324,15 @@ class FiberBurstWidget(QWidget):
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addWidget(scroll)
+
+    def _settings(self) -> QWidget:
+        """Return what most runs need nothing of."""
+        settings = QWidget()
+        column = QVBoxLayout(settings)
+        column.setContentsMargins(0, 0, 0, 0)
+        for widget in (self.form, self._memory, self.copying):
+            column.addWidget(widget)
+        return settings
 
     def _connect(self) -> None:
         self.start_button.clicked.connect(lambda: self.start())

@@ -84,7 +84,7 @@ class Runner(QObject):
         worker.finished.connect(self._end)
         # Where there is no window for it, napari's bar would go to the terminal.
         self._progress = progress(total=1, desc=name, file=io.StringIO())
-        self._at_exit = atexit.register(partial(_wait_for_last_step, job.control))
+        self._at_exit = atexit.register(partial(_end, job.control))
         self._set(state="running")
         self.started.emit(job)
         self._paces = _paces()
@@ -193,9 +193,13 @@ def _note_drawing(pace: Pace, began: float) -> None:
     pace.note(began, time.perf_counter())
 
 
-def _wait_for_last_step(control: Control) -> None:
-    """Stop a run and wait for it, because Python is ending: a worker must not outlive the signals that it sends."""
-    control.stop()
+def wait_for_workers() -> None:
+    """Wait for what other threads are at, because Python is ending: a worker must not outlive the signals it sends."""
     pool = QThreadPool.globalInstance()
     if pool is not None:
         pool.waitForDone()
+
+
+def _end(control: Control) -> None:
+    control.stop()
+    wait_for_workers()
