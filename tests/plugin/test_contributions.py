@@ -75,6 +75,7 @@ def test_a_simulated_burst_opens_with_its_truth(tmp_path, simulated, ending):
     ((frames, look, _),) = contributions.get_reader(str(path))(str(path))
     np.testing.assert_array_equal(frames, simulated.arrays()["frames"])
     assert look["rgb"]
+    assert look["metadata"]["fiberburst"]["recording"] == {"channel_names": (), "times": ()}
     np.testing.assert_array_equal(look["metadata"]["fiberburst"]["homographies"], simulated.homographies)
 
 

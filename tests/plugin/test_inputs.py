@@ -3,8 +3,12 @@
 import dask.array as da
 import numpy as np
 import pytest
+import tifffile
 from napari.layers import Image, Labels, Shapes
 from napari.utils.notifications import notification_manager
+from npe2 import PluginManifest
+
+from napari_fiberburst import read_burst
 
 MILLISECONDS = 60_000
 
@@ -71,6 +75,59 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     assert [str(unit) for unit in image.units] == ["micrometer", "micrometer"]
     for own in ("frame outlines", "frame centres"):
         np.testing.assert_allclose(viewer.layers[f"run 1: {own}"].scale, [1, 0.5, 0.25])
+
+
+@pytest.fixture
+def ome_file(tmp_path, simulated):
+    """Return a file of two channels, half a micrometre by a quarter a pixel, a frame each 0.2 s."""
+    path = tmp_path / "recorded.ome.tif"
+    told = {
+        "axes": "TCYX",
+        "PhysicalSizeY": 0.5,
+        "PhysicalSizeX": 0.25,
+        "TimeIncrement": 0.2,
+        "Channel": {"Name": ["red", "green"]},
+    }
+    tifffile.imwrite(path, simulated.arrays()["frames"][..., :2].transpose(0, 3, 1, 2), metadata=told)
+    return path
+
+
+def test_what_an_ome_tiff_says_is_in_results_although_napari_opens_it(
+    open_dock, run_through, npe2pm, ome_file, tmp_path
+):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock()
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    np.testing.assert_array_equal(layer.scale, [1, 1, 0.5, 0.25])
+    run = run_through(dock)
+    known = run.result.acquisition
+    assert (known.pixel_size, known.unit) == ((0.5, 0.25), "µm")
+    assert known.channel_names == ("red", "green")
+    np.testing.assert_allclose(known.times, 0.2 * np.arange(8))
+    image = viewer.layers["run 1: image"]
+    np.testing.assert_array_equal(image.scale[-2:], [0.5, 0.25])
+    assert [str(unit) for unit in image.units[-2:]] == ["micrometer", "micrometer"]
+    dock.runs.save_result(run, tmp_path / "out.ome.tif")
+    written = read_burst(tmp_path / "out.ome.tif", axes="CYX")
+    assert (written.pixel_size, written.unit) == ((0.5, 0.25), "µm")
+    assert written.channel_names == ("red", "green")
+
+
+def test_a_file_moves_no_layer_apart_from_those_that_lie_over_it(open_dock, npe2pm, ome_file):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock(Shapes([np.array([[5.0, 8.0], [5.0, 47.0], [40.0, 47.0], [40.0, 8.0]])]))
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    np.testing.assert_array_equal(layer.scale, 1)
+    assert dock.input.source().read().pixel_size == (0.5, 0.25)
+
+
+def test_what_a_file_says_of_other_frames_is_left_out(open_dock, npe2pm, ome_file):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock()
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    layer.data = layer.data[2:, :1]
+    burst = dock.input.source().read()
+    assert (burst.times, burst.channel_names) == (None, ())
 
 
 @pytest.mark.parametrize("order", ["TCYX", "CTYX"])

@@ -104,7 +104,7 @@ def test_axes_region_and_channels_are_in_the_call():
     turned = source(path="b.tif", axes="CTYX", region=((1, 20), (2, 30)), arrays=(np.zeros((2, 5, 31, 37)),))
     assert "Burst(viewer.layers['a'].data, axes='CTYX').crop((1, 20), (2, 30))" in as_python(turned, {})
     assert "--axes CTYX --crop 1:20,2:30" in as_command(turned, {})
-    several = source(names=("r", "g"), arrays=(np.zeros((5, 31, 37)),) * 2)
+    several = source(names=("r", "g"), channel_names=("r", "g"), arrays=(np.zeros((5, 31, 37)),) * 2)
     assert (
         "Burst([viewer.layers['r'].data, viewer.layers['g'].data], axes='CTYX', channel_names=('r', 'g'))"
         in as_python(several, {})

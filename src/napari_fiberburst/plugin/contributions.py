@@ -12,7 +12,7 @@ import numpy as np
 import tifffile
 
 from napari_fiberburst.io.read import ARCHIVE_ENDINGS
-from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.burst import Burst
@@ -133,7 +133,8 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
     )
     if frames.ndim == 4 and not look["rgb"]:
         frames = frames.transpose(0, 3, 1, 2)  # napari draws the last two axes
-    look["metadata"][METADATA_KEY]["shape"] = frames.shape
+    recording = {"channel_names": burst.channel_names, "times": () if burst.times is None else burst.times.tolist()}
+    look["metadata"][METADATA_KEY] |= {"shape": frames.shape, RECORDING_KEY: recording}
     return [(frames, look, "image")]
 
 
