@@ -20,6 +20,12 @@ def notices_during(act):
     return [record.message for record in list(notification_manager.records)[before:]]
 
 
+def switch_on(dock, *kinds):
+    """Show these on the result card."""
+    for kind in kinds:
+        dock.display.card.switches[kind].setChecked(True)
+
+
 @pytest.mark.parametrize(
     ("layers", "words"),
     [
@@ -65,6 +71,7 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     viewer, dock = open_dock(layer)
     dock.form.set_choices({"upsample": 2.0})
     run = run_through(dock)
+    switch_on(dock, "stabilised burst", "outlines", "path")
     image, still = viewer.layers["run 1: image"], viewer.layers["run 1: stabilised burst"]
     assert run.result.acquisition.pixel_size == (0.5, 0.25)
     assert run.result.acquisition.unit == "µm"
@@ -73,7 +80,7 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     assert image.axis_labels == ("y", "x")
     assert still.axis_labels == ("t", "y", "x")
     assert [str(unit) for unit in image.units] == ["micrometer", "micrometer"]
-    for own in ("frame outlines", "frame centres"):
+    for own in ("outlines", "path"):
         np.testing.assert_allclose(viewer.layers[f"run 1: {own}"].scale, [1, 0.5, 0.25])
 
 
@@ -140,6 +147,7 @@ def test_channels_that_are_no_colours_stay_an_axis(open_dock, run_through, simul
     expected = np.moveaxis(run.result.image, 2, 0)
     shown = image.data if order == "TCYX" else image.data[:, 3]
     np.testing.assert_array_equal(shown, expected)
+    switch_on(dock, "stabilised burst")
     assert viewer.layers["run 1: stabilised burst"].data.shape == viewer.layers[0].data.shape
 
 
@@ -156,11 +164,17 @@ def test_grey_layers_make_one_burst(open_dock, run_through, qtbot, simulated):
     assert run.result.acquisition.channel_names == names
     for number, name in enumerate(names):
         np.testing.assert_array_equal(viewer.layers[f"run 1: image of {name}"].data, run.result.image[..., number])
+    switch_on(dock, "stabilised burst")
+    for name in names:
+        assert viewer.layers[f"run 1: stabilised burst of {name}"].data.shape == (8, 63, 75)
+    dock.display.card.switches["stabilised burst"].setChecked(False)
+    assert not [layer for layer in viewer.layers if "stabilised" in layer.name]
 
 
 def test_a_dask_layer_is_a_burst(open_dock, run_through, grey_frames):
     viewer, dock = open_dock(Image(da.from_array(grey_frames, chunks=(1, 63, 75))))
     assert run_through(dock).result.image.shape == (63, 75)
+    switch_on(dock, "stabilised burst")
     still = viewer.layers["run 1: stabilised burst"].data
     assert isinstance(still, da.Array)
     np.testing.assert_array_equal(still[0].compute(), grey_frames[0])
@@ -186,7 +200,8 @@ def test_axes_of_length_one_in_front_are_no_hindrance(open_dock, run_through, gr
     viewer, dock = open_dock(Image(grey_frames[None, None]))
     run = run_through(dock)
     np.testing.assert_array_equal(viewer.layers["run 1: image"].data, run.result.image)
-    assert viewer.layers["run 1: frame centres"].data.shape == (8, 4)
+    switch_on(dock, "path")
+    assert viewer.layers["run 1: path"].data.shape == (8, 4)
 
 
 @pytest.mark.parametrize("axes", ["TYXQ", "CYXT"])

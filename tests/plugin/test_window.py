@@ -37,6 +37,11 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
     qtbot.wait(200)
     after = viewer.window.screenshot(canvas_only=True, flash=False)
     assert dock.runs.run.result.ending == "finished"
+    # All of the way from the burst to what came of it is in sight.
+    viewer.window.resize(1280, 800)
+    seen = dock.findChild(QScrollArea)
+    qtbot.waitUntil(lambda: seen.verticalScrollBar().maximum() == 0)
+    qtbot.waitUntil(lambda: seen.widget().width() <= seen.viewport().width())
     # The honeycomb's dark gaps are gone from what is on the screen.
     assert dark(after) < 0.5 * dark(before)
     folder = Path(os.environ.get("FIBERBURST_SCREENSHOTS", tmp_path))

@@ -8,11 +8,10 @@ from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_error
-from qtpy.QtCore import QEvent, QSize, Qt
+from qtpy.QtCore import QEvent, QSize
 from qtpy.QtWidgets import (
     QLabel,
     QPushButton,
-    QScrollArea,
     QVBoxLayout,
     QWidget,
 )
@@ -36,7 +35,7 @@ from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
 from napari_fiberburst.plugin.runner import Runner, wait_for_workers
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
-from napari_fiberburst.plugin.sections import row_of, section
+from napari_fiberburst.plugin.sections import Column, row_of, section
 from napari_fiberburst.settings import SplineMethod, choose
 
 if TYPE_CHECKING:
@@ -76,7 +75,6 @@ class FiberBurstWidget(QWidget):
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
-        self._scroll = QScrollArea()
         self.copying = CopyButtons(self.input, self.form)
         self.departures = Departures()
         self._burst: Layer | None = None
@@ -130,13 +128,6 @@ class FiberBurstWidget(QWidget):
     def sizeHint(self) -> QSize:
         """Ask for a narrow dock: the image is what matters."""
         return QSize(_WIDTH, super().sizeHint().height())
-
-    def minimumSizeHint(self) -> QSize:
-        """Ask for as much width as what is in the dock needs, which scrolls downwards alone: nothing is cut off."""
-        content, bar = self._scroll.widget(), self._scroll.verticalScrollBar()
-        if content is None or bar is None:
-            return super().minimumSizeHint()
-        return QSize(content.minimumSizeHint().width() + bar.sizeHint().width(), super().minimumSizeHint().height())
 
     def event(self, event: QEvent | None) -> bool:
         """Notice when the dock is closed for good: napari takes the widget out of it, and does not delete it."""
@@ -201,9 +192,10 @@ class FiberBurstWidget(QWidget):
             self.runs.refresh()
 
     def _show_what_was_asked(self, run: KeptRun) -> None:
-        """Hide the image where something else of a result was asked for, now that all is there."""
+        """Show something else of a result than its image, where that was asked for."""
         if run is self._run and self._shown_at_end != "image":
-            run.layers.set_visible(self._shown_at_end, True)
+            run.layers.switch(self._shown_at_end, True)
+            self.display.card.refresh()
             run.layers.set_visible("image", False)
 
     def _fail(self, problem: str) -> None:
@@ -310,16 +302,13 @@ class FiberBurstWidget(QWidget):
         column.addWidget(self.departures)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
         column.addWidget(self.display.status_box)
+        column.addWidget(self.display.card)
         column.addWidget(section("Settings", self._settings()))
         column.addWidget(self.display.curve_box)
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
         column.addStretch(1)
-        scroll = self._scroll
-        scroll.setWidgetResizable(True)
-        scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        scroll.setFrameShape(QScrollArea.Shape.NoFrame)
-        scroll.setWidget(content)
+        scroll = Column(content)
         WheelFilter(scroll)
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)

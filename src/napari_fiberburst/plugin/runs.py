@@ -10,7 +10,6 @@ from qtpy.QtCore import Qt, Signal
 from qtpy.QtWidgets import (
     QComboBox,
     QFileDialog,
-    QLabel,
     QListWidget,
     QListWidgetItem,
     QPushButton,
@@ -23,6 +22,7 @@ from napari_fiberburst.errors import BundleError, FiberBurstError
 from napari_fiberburst.io.results import write_homographies
 from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
+from napari_fiberburst.plugin.evidence import MOTION_KINDS
 from napari_fiberburst.plugin.history import History
 from napari_fiberburst.plugin.job import CurvePoint, Scores
 from napari_fiberburst.plugin.layers import RunLayers
@@ -83,25 +83,28 @@ class KeptRun:
     scores: Scores | None = None
 
     @property
-    def summary(self) -> str:
-        """What came of it, in a few lines."""
+    def summary(self) -> tuple[str, ...]:
+        """What came of it, line by line, but for the verdict."""
         result = self.result
         if result is None:
-            return ""
-        used = "" if result.frames_used is None else f", {len(result.frames_used)} of {len(result.homographies)} frames"
-        verdict = "" if result.quality is None else f"{result.quality}; "
-        lines = [f"{verdict}{result.ending} in {result.seconds:.1f} s on {result.device}{used}"]
+            return ()
+        seen = []
         if result.resolution is not None:
             size, unit = result.acquisition.pixel_size, result.acquisition.unit
             length = "" if size is None else f" = {result.resolution * sum(size) / 2:.3g} {unit}"
-            lines.append(f"halves of the burst agree down to {result.resolution:.1f} px{length}")
+            seen.append(f"finest detail {result.resolution:.1f} px{length}")
+        if result.frames_used is not None:
+            seen.append(f"{len(result.frames_used)} of {len(result.homographies)} frames")
+        ended = f"{result.ending} in {result.seconds:.1f} s on {result.device}"
+        filled = "" if result.coverage is None else f"{(result.coverage == 0).mean():.1%} filled in · "
+        lines = [" · ".join(seen), filled + ended]
         if self.scores is not None:
             scores = self.scores
             lines.append(
                 f"against the truth: PSNR {scores.psnr:.1f} dB, SSIM {scores.ssim:.3f}, motion off by "
                 f"{scores.motion_error:.2g} px"
             )
-        return "\n".join([*lines, *(f"Note: {note}" for note in result.notes)])
+        return (*filter(None, lines), *(f"Note: {note}" for note in result.notes))
 
     @property
     def has_bundle(self) -> bool:
@@ -131,14 +134,11 @@ class RunsPanel(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self._runs: list[KeptRun] = []
+        self._runs: list[KeptRun] = []  # newest first, as they are listed
         self._is_running = False
         self.list_of_runs = QListWidget()
         self.list_of_runs.setMaximumHeight(_LINES_OF_RUNS * self.fontMetrics().height() + 16)
-        self.list_of_runs.setToolTip("The runs so far; double-click one to name it.")
-        self._summary = QLabel()
-        self._summary.setWordWrap(True)
-        self._summary.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.list_of_runs.setToolTip("The runs so far, the newest first; double-click one to name it.")
         self.other = QComboBox()
         self.other.setToolTip("The run to compare with the one selected above.")
         self.compare_button = QPushButton("A / B")
@@ -165,18 +165,22 @@ class RunsPanel(QWidget):
     @property
     def runs(self) -> tuple[KeptRun, ...]:
         """All runs, oldest first."""
-        return tuple(self._runs)
+        return tuple(reversed(self._runs))
 
     def add(self, run: KeptRun) -> None:
-        """Keep a run and select it."""
+        """Keep a run, at the top of the list, and select it."""
         # Nobody can tell the outlines of two runs apart, and all that is shown makes each drawing slower.
         for before in self._runs:
-            before.layers.set_visible("frame", False)
-        self._runs.append(run)
+            for kind in MOTION_KINDS:
+                before.layers.switch(kind, False)
+        self._runs.insert(0, run)
         item = QListWidgetItem(run.name)
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsEditable)
-        self.list_of_runs.addItem(item)
+        self.list_of_runs.blockSignals(True)
+        self.list_of_runs.insertItem(0, item)
+        self.list_of_runs.blockSignals(False)
         self.list_of_runs.setCurrentItem(item)
+        self.list_of_runs.scrollToItem(item)
         self._follow()
 
     def refresh(self) -> None:
@@ -230,7 +234,6 @@ class RunsPanel(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.list_of_runs)
-        layout.addWidget(self._summary)
         for widgets in rows:
             layout.addLayout(row_of(*widgets))
 
@@ -250,8 +253,6 @@ class RunsPanel(QWidget):
         run = self.run
         result = None if run is None else run.result
         has_result = result is not None
-        self._summary.setText("" if run is None else run.summary)
-        self._summary.setVisible(has_result)
         for button in (self.save_button, self.save_motion_button):
             button.setEnabled(has_result)
         self.remove_button.setEnabled(has_result or (run is not None and not self._is_running))
