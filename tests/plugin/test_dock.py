@@ -3,8 +3,10 @@
 from html import escape
 
 import numpy as np
+import pytest
 from napari.layers import Image
 from pyqtgraph import PlotWidget
+from qtpy.QtCore import Qt
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
@@ -189,7 +191,7 @@ def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock
 
     dock.display.curve_box.expand(animate=False)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])
-    dock.runs.list_of_runs.setCurrentRow(1)
+    dock.runs.select(first)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in first.curve if np.isfinite(point.loss)])
     assert len(drawn()) > 0
     dock.runs.remove(first)
@@ -247,11 +249,11 @@ def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)
     run_through(dock)
-    dock.runs.list_of_runs.item(0).setText("sharp")
+    dock.runs.table.item(0, 0).setText("sharp")
     assert "sharp: image" in viewer.layers
     assert viewer.layers["sharp: image"].metadata["fiberburst"]["run"] == "sharp"
-    dock.runs.list_of_runs.item(0).setText(" ")
-    assert dock.runs.list_of_runs.item(0).text() == "sharp"
+    dock.runs.table.item(0, 0).setText(" ")
+    assert dock.runs.table.item(0, 0).text() == "sharp"
 
 
 def switch(dock, *kinds, on=True):
@@ -300,7 +302,7 @@ def test_the_card_says_what_came_of_the_run(open_dock, run_through, grey_frames)
     assert f"{100 * (result.coverage == 0).mean():.1f}% filled in" in words
     assert f"finished in {result.seconds:.1f} s" in words
     for note in result.notes:
-        assert escape(note) in words
+        assert escape(note) in dock.display.card.notes.text()
 
 
 def test_a_layer_that_a_user_deletes_is_switched_off(open_dock, run_through, burst_layer):
@@ -343,14 +345,40 @@ def test_the_list_of_runs_shows_the_newest_first(open_dock, run_through, burst_l
     dock.form.set_choices(QUICK)
     for _ in range(3):
         run_through(dock)
-    listed = dock.runs.list_of_runs
-    assert [listed.item(row).text() for row in range(3)] == ["run 3", "run 2", "run 1"]
-    assert dock.runs.run.name == "run 3"
-    listed.setCurrentRow(2)
+    table = dock.runs.table
+    first, second, third = dock.runs.runs
+
+    def listed():
+        return [table.item(row, 0).text() for row in range(table.rowCount())]
+
+    assert listed() == ["run 3", "run 2", "run 1"]
+    assert dock.runs.run is third
+    dock.runs.select(first)
     switch(dock, "path")
     assert "run 1: path" in viewer.layers
-    listed.setCurrentRow(0)
+    dock.runs.select(third)
     assert not dock.display.card.switches["path"].isChecked()
+    # Sorted by what a heading says, rows are still those of their runs.
+    seconds = {run.name: run.result.seconds for run in (first, second, third)}
+    table.sortByColumn(2, Qt.SortOrder.AscendingOrder)
+    assert [round(seconds[name], 1) for name in listed()] == sorted(round(value, 1) for value in seconds.values())
+    assert dock.runs.run is third
+    table.sortByColumn(0, Qt.SortOrder.AscendingOrder)
+    assert listed() == ["run 1", "run 2", "run 3"]
+    dock.runs.select(second)
+    dock.runs.remove_button.click()
+    assert listed() == ["run 1", "run 3"]
+    assert "run 2: image" not in viewer.layers
+
+
+def test_a_row_tells_what_came_of_its_run(open_dock, run_through, burst_layer):
+    _, dock = open_dock(burst_layer)
+    result = run_through(dock).result
+    cells = [dock.runs.table.item(0, column).text() for column in range(5)]
+    assert cells[:2] == ["run 1", "spline"]
+    assert float(cells[2]) == round(result.seconds, 1)
+    assert cells[3] == result.quality
+    assert float(cells[4]) == pytest.approx(result.held_out_rmse, rel=0.01)
 
 
 def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
@@ -358,7 +386,7 @@ def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
     dock.form.set_choices(QUICK)
     for _ in range(3):
         run_through(dock)
-    dock.runs.list_of_runs.setCurrentRow(2)
+    dock.runs.select(dock.runs.runs[0])
     dock.runs.other.setCurrentIndex(1)
     dock.runs.compare_button.click()
     assert [viewer.layers[f"run {number}: image"].visible for number in (1, 2, 3)] == [False, True, False]

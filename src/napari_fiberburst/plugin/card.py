@@ -30,8 +30,8 @@ class ResultCard(QWidget):
 
     Attributes
     ----------
-    words : QLabel
-        What came of the run.
+    words, notes : QLabel
+        What came of the run, and what to know before trusting it.
     switches : dict of str to QCheckBox
         By what they show.
     """
@@ -40,14 +40,16 @@ class ResultCard(QWidget):
         super().__init__(parent)
         self._viewer = viewer
         self._run: KeptRun | None = None
-        self.words = QLabel()
-        self.words.setWordWrap(True)
-        self.words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.words, self.notes = QLabel(), QLabel()
+        for label in (self.words, self.notes):
+            label.setWordWrap(True)
+            label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.switches = {kind: QCheckBox(kind) for kind in KINDS}
         layout, self._grid = QVBoxLayout(self), QGridLayout()
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.words)
         layout.addLayout(self._grid)
+        layout.addWidget(self.notes)
         for kind, switch in self.switches.items():
             switch.setToolTip(KINDS[kind])
             switch.toggled.connect(lambda on, kind=kind: self._switch(kind, on))
@@ -79,7 +81,10 @@ class ResultCard(QWidget):
         if offered != [kind for kind, switch in self.switches.items() if not switch.isHidden()]:
             self._offer(offered)
         self.words.setText("" if run is None else _in_words(run))
-        self.words.setVisible(bool(self.words.text()))
+        notes = () if run is None or run.result is None else run.result.notes
+        self.notes.setText("<br>".join(f"Note: {escape(note)}" for note in notes))
+        for label in (self.words, self.notes):
+            label.setVisible(bool(label.text()))
         self.setVisible(bool(offered))
 
     def _offer(self, kinds: list[str]) -> None:
