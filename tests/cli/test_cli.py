@@ -22,7 +22,7 @@ SMALL = ["--preset", "paper", "--scene-width", "16", "--motion-width", "16", "--
 
 @pytest.fixture
 def burst_file(tmp_path):
-    path = tmp_path / "burst.npz"
+    path = tmp_path / "tissue.burst"
     assert main(["simulate", "-o", str(path), "--shape", "33x41", "--frames", "3", "--pitch", "3"]) == 0
     return path
 
@@ -35,7 +35,7 @@ def test_simulate_writes_the_burst_and_its_truth(burst_file):
 
 
 def test_simulate_takes_every_fault_as_an_option(tmp_path):
-    path = tmp_path / "faulty.npz"
+    path = tmp_path / "faulty.burst"
     command = ["simulate", "-o", str(path), "--shape", "43x51", "--frames", "5", "--pitch", "4", "--channels", "1"]
     faults = ["--flicker", "0.05", "--deformation", "2", "--deformation-length", "30", "--vignette", "3", "--overlay"]
     assert main([*command, *faults, "--black-frames", "1", "--contrast", "0.1"]) == 0
@@ -63,7 +63,7 @@ def test_simulate_takes_every_fault_as_an_option(tmp_path):
 def test_simulate_takes_a_flat_field_image_as_the_bundle(tmp_path):
     flat = simulate(shape=(67, 83), frames=1, pitch=6.0).transmission
     tifffile.imwrite(tmp_path / "flat.tif", np.rint(1000 * flat).astype(np.uint16))
-    path = tmp_path / "burst.npz"
+    path = tmp_path / "tissue.burst"
     command = ["simulate", "-o", str(path), "--flat", str(tmp_path / "flat.tif"), "--frames", "3"]
     assert main([*command, "--physics", "core"]) == 0
     with np.load(path) as arrays:
@@ -76,7 +76,7 @@ def test_simulate_takes_a_flat_field_image_as_the_bundle(tmp_path):
 
 
 def test_simulate_refuses_faults_that_cannot_be(tmp_path, capsys):
-    assert main(["simulate", "-o", str(tmp_path / "a.npz"), "--shape", "33x41", "--flicker", "-1"]) == 2
+    assert main(["simulate", "-o", str(tmp_path / "a.burst"), "--shape", "33x41", "--flicker", "-1"]) == 2
     assert "flicker must be a number of at least 0" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -148,11 +148,12 @@ def test_bad_input_says_why_and_leaves_no_file(burst_file, tmp_path, capsys, cha
     assert list(tmp_path.iterdir()) == [burst_file]
 
 
-def test_the_burst_is_not_written_over(burst_file, capsys):
-    before = burst_file.read_bytes()
-    assert main(["reconstruct", str(burst_file), "-o", str(burst_file), "--iterations", "1", *SMALL]) == 2
+def test_the_burst_is_not_written_over(burst_file, tmp_path, capsys):
+    burst = burst_file.rename(tmp_path / "of_an_earlier_version.npz")
+    before = burst.read_bytes()
+    assert main(["reconstruct", str(burst), "-o", str(burst), "--iterations", "1", *SMALL]) == 2
     assert "would be lost" in capsys.readouterr().err
-    assert burst_file.read_bytes() == before
+    assert burst.read_bytes() == before
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGINT to send")
@@ -182,7 +183,7 @@ def test_a_missing_burst_is_said(tmp_path, capsys):
     [
         ["reconstruct", "burst.npz", "-o", "a.tif", "--crop", "5-9"],
         ["reconstruct", "burst.npz", "-o", "a.tif", "--motion", "zoom"],
-        ["simulate", "-o", "a.npz", "--shape", "9"],
+        ["simulate", "-o", "a.burst", "--shape", "9"],
         ["reconstruct"],
         [],
     ],

@@ -87,7 +87,8 @@ def test_layers_may_change_while_running(open_dock, qtbot, burst_layer, deed):
     names = [layer.name for layer in viewer.layers]
     assert dock.runs.run.result.ending == "finished"
     assert ("run 1: image" in names) == (deed != "delete image")
-    assert "run 1: coverage" in names
+    dock.display.card.switches["coverage"].setChecked(True)
+    assert "run 1: coverage" in viewer.layers
 
 
 def test_a_closed_dock_stops_its_run_and_a_hidden_one_does_not(open_dock, qtbot, burst_layer):

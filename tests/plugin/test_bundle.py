@@ -89,14 +89,10 @@ def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
     second = run_through(dock)
     assert second.result.image.shape == (63, 75, 3)
     np.testing.assert_allclose(second.result.bundle.centres, first.result.bundle.centres, atol=0.1)
-    assert {layer.name.removeprefix("run 2: ") for layer in viewer.layers if layer.name.startswith("run 2")} == {
-        "image",
-        "coverage",
-        "frames behind each pixel",
-        "uncertainty",
-        "transmission",
-        "residuals",
-    }
+    switches = dock.display.card.switches
+    offered = [kind for kind, box in switches.items() if not box.isHidden()]
+    assert offered == ["coverage", "frames", "uncertainty", "transmission", "residuals"]
+    switches["residuals"].setChecked(True)
     assert viewer.layers["run 2: residuals"].data.shape == (63, 75)
     assert f"bundle={str(path)!r}" in second.python
 

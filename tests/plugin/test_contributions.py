@@ -67,13 +67,31 @@ def test_a_faulty_sample_is_told_from_others_by_its_name_its_recipe_and_its_trut
     np.testing.assert_array_equal(again.arrays()["frames"], frames)
 
 
-def test_an_npz_burst_opens_with_its_truth(tmp_path, simulated):
-    path = tmp_path / "burst.npz"
-    np.savez(path, **simulated.arrays())
+@pytest.mark.parametrize("ending", [".burst", ".npz"])
+def test_a_simulated_burst_opens_with_its_truth(tmp_path, simulated, ending):
+    path = tmp_path / f"tissue{ending}"
+    with path.open("wb") as stream:
+        np.savez(stream, **simulated.arrays())
     ((frames, look, _),) = contributions.get_reader(str(path))(str(path))
     np.testing.assert_array_equal(frames, simulated.arrays()["frames"])
     assert look["rgb"]
+    assert look["metadata"]["fiberburst"]["recording"] == {"channel_names": (), "times": ()}
     np.testing.assert_array_equal(look["metadata"]["fiberburst"]["homographies"], simulated.homographies)
+
+
+def test_a_simulated_burst_that_is_dropped_on_the_window_opens(make_napari_viewer, npe2pm, tmp_path, simulated):
+    """That of napari itself, which reads numpy's archives, must not be taken for it."""
+    npe2pm.register(MANIFEST)
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    path = tmp_path / "tissue.burst"
+    with path.open("wb") as stream:
+        np.savez(stream, **simulated.arrays())
+    viewer = make_napari_viewer()
+    viewer.open(str(path), plugin=None)
+    (layer,) = viewer.layers
+    assert layer.source.reader_plugin == "napari-fiberburst"
+    np.testing.assert_array_equal(layer.data, simulated.arrays()["frames"])
+    assert "truth" in layer.metadata["fiberburst"]
 
 
 def test_a_folder_of_frames_opens_as_a_stack(tmp_path, grey_frames):
@@ -99,6 +117,7 @@ def test_a_result_layer_is_written_with_its_provenance(open_dock, run_through, b
     assert tifffile.imread(written[0]).shape == (3, 63, 75)
     assert json.loads((tmp_path / "out.json").read_text())["ending"] == "finished"
     # napari gives the writer other images too.
+    dock.display.card.switches["coverage"].setChecked(True)
     viewer.layers["run 1: coverage"].save(str(tmp_path / "coverage.ome.tif"))
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "coverage.ome.tif"), viewer.layers["run 1: coverage"].data)
     contributions.write(str(tmp_path / "b.ome.tif"), *burst_layer.as_layer_data_tuple()[:2])
@@ -114,6 +133,7 @@ def test_the_layers_menu_registers_and_reconstructs(make_napari_viewer, qtbot, b
     with qtbot.waitSignal(dock.display.complete, timeout=60_000):
         pass
     assert viewer.layers["run 1: stabilised burst"].visible
+    assert dock.display.card.switches["stabilised burst"].isChecked()
     assert not viewer.layers["run 1: image"].visible
 
 

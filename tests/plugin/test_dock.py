@@ -1,11 +1,18 @@
 """The dock as a user has it: one click, an image; and whatever else may happen to it."""
 
+from html import escape
+
 import numpy as np
+import pytest
 from napari.layers import Image
+from pyqtgraph import PlotWidget
+from qtpy.QtCore import Qt
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
+from napari_fiberburst.plugin import dock as dock_module
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.plugin.preferences import Preferences
 from napari_fiberburst.plugin.stacks import stabilised
 from napari_fiberburst.simulation import Camera, Faults, simulate
 
@@ -18,18 +25,7 @@ def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
     assert run.result.ending == "finished"
-    assert [layer.name for layer in viewer.layers] == [
-        "burst",
-        "run 1: stabilised burst",
-        "run 1: coverage",
-        "run 1: frames behind each pixel",
-        "run 1: uncertainty",
-        "run 1: transmission",
-        "run 1: residuals",
-        "run 1: image",
-        "run 1: frame outlines",
-        "run 1: frame centres",
-    ]
+    assert [layer.name for layer in viewer.layers] == ["burst", "run 1: image"]
     shown = viewer.layers["run 1: image"].data
     known = np.isfinite(run.result.image).all(axis=-1)
     np.testing.assert_allclose(shown[known][:, :3], np.clip(run.result.image[known] / 255, 0, 1), atol=1e-6)
@@ -153,6 +149,56 @@ def test_the_form_is_as_it_was_left(open_dock, burst_layer):
     again.shut_down()
 
 
+def test_what_is_remembered_is_told_with_one_click_back(open_dock, burst_layer, grey_frames):
+    viewer, dock = open_dock(burst_layer)
+    assert dock.departures.isHidden()
+    dock.form.set_choices({"preset": "paper", "sigma": 2.0})
+    assert dock.departures.words.text() == "set: paper, sigma 2.0"
+    again = FiberBurstWidget(viewer)
+    assert not again.departures.isHidden()
+    assert again.departures.words.text() == "as last time: paper, sigma 2.0"
+    again.departures.back_button.click()
+    assert again.form.choices() == {}
+    assert again.departures.isHidden()
+    again.shut_down()
+    # Nor is it told less where the next burst comes in the same window.
+    dock.input.burst.value = viewer.add_layer(Image(grey_frames, name="next"))
+    assert dock.departures.words.text() == "as last time: paper, sigma 2.0"
+
+
+def test_a_preset_that_is_preferred_needs_no_word(open_dock, burst_layer, monkeypatch):
+    monkeypatch.setattr(dock_module, "preferences", lambda: Preferences(preset="paper"))
+    _, dock = open_dock(burst_layer)
+    assert dock.form.choices() == {"preset": "paper"}
+    assert dock.departures.isHidden()
+    dock.form.set_choices({"device": "cpu"})
+    assert dock.departures.words.text() == "set: auto, device cpu"
+
+
+def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock, run_through, burst_layer):
+    _, dock = open_dock(burst_layer)
+    dock.form.set_choices(QUICK)
+    first = run_through(dock)
+    dock.form.set_choices({**QUICK, "iterations": 4})
+    second = run_through(dock)
+
+    def drawn():
+        (plot,) = [
+            plot for plot in dock.display.curve_box.findChildren(PlotWidget) if plot.getAxis("left").labelText == "loss"
+        ]
+        seconds = plot.listDataItems()[0].getOriginalDataset()[0]
+        return [] if seconds is None else seconds
+
+    dock.display.curve_box.expand(animate=False)
+    np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])
+    dock.runs.select(first)
+    np.testing.assert_array_equal(drawn(), [point.seconds for point in first.curve if np.isfinite(point.loss)])
+    assert len(drawn()) > 0
+    dock.runs.remove(first)
+    dock.runs.remove(second)
+    assert len(drawn()) == 0
+
+
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     run = run_through(dock)
@@ -181,7 +227,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     dock.copying.command.click()
     command = QApplication.clipboard().text()
     assert command.splitlines()[-1] == (
-        "fiberburst reconstruct burst.npz -o image.ome.tif --motion affine --upsample 2.0"
+        "fiberburst reconstruct simulated.burst -o image.ome.tif --motion affine --upsample 2.0"
     )
 
 
@@ -203,20 +249,136 @@ def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)
     run_through(dock)
-    dock.runs.list_of_runs.item(0).setText("sharp")
+    dock.runs.table.item(0, 0).setText("sharp")
     assert "sharp: image" in viewer.layers
     assert viewer.layers["sharp: image"].metadata["fiberburst"]["run"] == "sharp"
-    dock.runs.list_of_runs.item(0).setText(" ")
-    assert dock.runs.list_of_runs.item(0).text() == "sharp"
+    dock.runs.table.item(0, 0).setText(" ")
+    assert dock.runs.table.item(0, 0).text() == "sharp"
+
+
+def switch(dock, *kinds, on=True):
+    for kind in kinds:
+        dock.display.card.switches[kind].setChecked(on)
+
+
+def offered(dock):
+    return [kind for kind, box in dock.display.card.switches.items() if not box.isHidden()]
+
+
+def test_each_switch_makes_its_layer_and_takes_it_away(open_dock, run_through, burst_layer):
+    viewer, dock = open_dock(burst_layer)
+    assert dock.display.card.isHidden()
+    run = run_through(dock)
+    assert offered(dock) == [
+        "outlines",
+        "path",
+        "coverage",
+        "frames",
+        "uncertainty",
+        "transmission",
+        "residuals",
+        "stabilised burst",
+    ]
+    for kind in offered(dock):
+        switch(dock, kind)
+        layer = viewer.layers[f"run 1: {kind}"]
+        assert layer.visible
+        assert layer.metadata["fiberburst"]["run"] == "run 1"
+        # What is asked for is seen: no image of the run lies over it.
+        assert viewer.layers.index(layer) > viewer.layers.index("run 1: image")
+        assert len(viewer.layers) == 3
+        switch(dock, kind, on=False)
+        assert [layer.name for layer in viewer.layers] == ["burst", "run 1: image"]
+    assert viewer.layers["run 1: image"].metadata["fiberburst"]["reconstruction"] is run.result
+
+
+def test_the_card_says_what_came_of_the_run(open_dock, run_through, grey_frames):
+    _, dock = open_dock(Image(grey_frames, scale=(1, 0.5, 0.5), units=("s", "um", "um")))
+    result = run_through(dock).result
+    words = dock.display.card.words.text()
+    assert f"{result.quality}</b>" in words
+    assert f"finest detail {result.resolution:.1f} px = {result.resolution / 2:.3g} µm" in words
+    assert f"{len(result.frames_used)} of 8 frames" in words
+    assert f"{100 * (result.coverage == 0).mean():.1f}% filled in" in words
+    assert f"finished in {result.seconds:.1f} s" in words
+    for note in result.notes:
+        assert escape(note) in dock.display.card.notes.text()
+
+
+def test_a_layer_that_a_user_deletes_is_switched_off(open_dock, run_through, burst_layer):
+    viewer, dock = open_dock(burst_layer)
+    run_through(dock)
+    switch(dock, "coverage")
+    viewer.layers.remove("run 1: coverage")
+    assert not dock.display.card.switches["coverage"].isChecked()
+    switch(dock, "coverage")
+    assert "run 1: coverage" in viewer.layers
+
+
+def test_outlines_can_be_seen_while_a_run_goes_and_follow_it(open_dock, qtbot, burst_layer):
+    viewer, dock = open_dock(burst_layer)
+    dock.form.set_choices({**NETWORK, "iterations": 100_000})
+    with qtbot.waitSignal(dock.runner.previewed, timeout=MILLISECONDS):
+        dock.start()
+    qtbot.waitUntil(lambda: offered(dock) == ["outlines", "path"], timeout=MILLISECONDS)
+    switch(dock, "outlines", "path")
+    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
+        dock.stop_button.click()
+    homographies = dock.runs.run.result.homographies
+    corner = homographies[3] @ [-0.5, -0.5, 1]
+    (outline,) = [shape for shape in viewer.layers["run 1: outlines"].data if shape[0, 0] == 3]
+    np.testing.assert_allclose(outline[0, 1:], (corner[:2] / corner[2])[::-1], atol=1e-6)
+    assert len(viewer.layers["run 1: path"].data) == 8
 
 
 def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
     dock.form.set_choices(QUICK)
-    for _ in range(2):
+    run_through(dock)
+    switch(dock, "outlines", "path")
+    run_through(dock)
+    assert [layer.name for layer in viewer.layers] == ["burst", "run 1: image", "run 2: image"]
+
+
+def test_the_list_of_runs_shows_the_newest_first(open_dock, run_through, burst_layer):
+    viewer, dock = open_dock(burst_layer)
+    dock.form.set_choices(QUICK)
+    for _ in range(3):
         run_through(dock)
-    assert [viewer.layers[f"run {number}: frame outlines"].visible for number in (1, 2)] == [False, True]
-    assert [viewer.layers[f"run {number}: frame centres"].visible for number in (1, 2)] == [False, True]
+    table = dock.runs.table
+    first, second, third = dock.runs.runs
+
+    def listed():
+        return [table.item(row, 0).text() for row in range(table.rowCount())]
+
+    assert listed() == ["run 3", "run 2", "run 1"]
+    assert dock.runs.run is third
+    dock.runs.select(first)
+    switch(dock, "path")
+    assert "run 1: path" in viewer.layers
+    dock.runs.select(third)
+    assert not dock.display.card.switches["path"].isChecked()
+    # Sorted by what a heading says, rows are still those of their runs.
+    seconds = {run.name: run.result.seconds for run in (first, second, third)}
+    table.sortByColumn(2, Qt.SortOrder.AscendingOrder)
+    assert [round(seconds[name], 1) for name in listed()] == sorted(round(value, 1) for value in seconds.values())
+    assert dock.runs.run is third
+    table.sortByColumn(0, Qt.SortOrder.AscendingOrder)
+    assert listed() == ["run 1", "run 2", "run 3"]
+    dock.runs.select(second)
+    dock.runs.remove_button.click()
+    assert listed() == ["run 1", "run 3"]
+    assert "run 2: image" not in viewer.layers
+
+
+def test_a_row_tells_what_came_of_its_run(open_dock, run_through, burst_layer):
+    _, dock = open_dock(burst_layer)
+    result = run_through(dock).result
+    cells = [dock.runs.table.item(0, column).text() for column in range(5)]
+    assert cells[:2] == ["run 1", "spline"]
+    assert float(cells[2]) == round(result.seconds, 1)
+    assert cells[3] == result.quality
+    assert float(cells[4]) == pytest.approx(result.held_out_rmse, rel=0.01)
 
 
 def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
@@ -224,8 +386,8 @@ def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
     dock.form.set_choices(QUICK)
     for _ in range(3):
         run_through(dock)
-    dock.runs.list_of_runs.setCurrentRow(0)
-    dock.runs.other.setCurrentIndex(0)
+    dock.runs.select(dock.runs.runs[0])
+    dock.runs.other.setCurrentIndex(1)
     dock.runs.compare_button.click()
     assert [viewer.layers[f"run {number}: image"].visible for number in (1, 2, 3)] == [False, True, False]
     dock.runs.remove(dock.runs.runs[1])
@@ -250,12 +412,12 @@ def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_throu
     run = run_through(dock)
     result = run.result
     assert result.bends
-    arrows = viewer.layers["run 1: bending"]
-    assert not arrows.visible
+    switch(dock, "displacement", "outlines", "stabilised burst")
+    arrows = viewer.layers["run 1: displacement"]
     drawn = arrows.data[arrows.data[:, 0, 0] == 4, 1, 1:]
     rms = np.sqrt((result.displacement(4) ** 2).sum(axis=-1).mean())
     assert 0.5 * rms < np.sqrt((drawn**2).sum(axis=1).mean()) < 2 * rms
-    outline = [shape for shape in viewer.layers["run 1: frame outlines"].data if shape[0, 0] == 4]
+    outline = [shape for shape in viewer.layers["run 1: outlines"].data if shape[0, 0] == 4]
     assert len(outline[0]) > 4
     # Moved into place by all of its motion, a frame lies better on the object than by its homography alone.
     still = np.asarray(viewer.layers["run 1: stabilised burst"].data[4], dtype=np.float64)
@@ -264,6 +426,5 @@ def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_throu
     truth = gaussian_filter(bent.truth[0, ..., 0], 4)[inner]
     alike = [np.corrcoef(gaussian_filter(moved, 4)[inner].ravel(), truth.ravel())[0, 1] for moved in (still, plain)]
     assert alike[0] > alike[1]
-    assert (result.outliers.any()) == ("run 1: left out" in viewer.layers)
-    assert f">{result.quality}</b>" in dock.display.status.text()
-    assert run.summary.startswith(result.quality)
+    assert result.outliers.any() == ("left out" in offered(dock))
+    assert f">{result.quality}</b>" in dock.display.card.words.text()

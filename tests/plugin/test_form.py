@@ -122,7 +122,7 @@ def test_choices_of_another_version_are_left_out(form):
 
 def test_changed_preferences_win_over_what_was_left():
     usual = Preferences()
-    assert remembered(usual) == {"preset": "auto"}
+    assert remembered(usual) == {}
     remember({"motion": "affine"}, usual)
     assert remembered(usual) == {"motion": "affine"}
     assert remembered(Preferences(preset="paper", device="cpu")) == {"preset": "paper", "device": "cpu"}

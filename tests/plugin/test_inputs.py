@@ -3,8 +3,12 @@
 import dask.array as da
 import numpy as np
 import pytest
+import tifffile
 from napari.layers import Image, Labels, Shapes
 from napari.utils.notifications import notification_manager
+from npe2 import PluginManifest
+
+from napari_fiberburst import read_burst
 
 MILLISECONDS = 60_000
 
@@ -14,6 +18,12 @@ def notices_during(act):
     before = len(notification_manager.records)
     act()
     return [record.message for record in list(notification_manager.records)[before:]]
+
+
+def switch_on(dock, *kinds):
+    """Show these on the result card."""
+    for kind in kinds:
+        dock.display.card.switches[kind].setChecked(True)
 
 
 @pytest.mark.parametrize(
@@ -61,6 +71,7 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     viewer, dock = open_dock(layer)
     dock.form.set_choices({"upsample": 2.0})
     run = run_through(dock)
+    switch_on(dock, "stabilised burst", "outlines", "path")
     image, still = viewer.layers["run 1: image"], viewer.layers["run 1: stabilised burst"]
     assert run.result.acquisition.pixel_size == (0.5, 0.25)
     assert run.result.acquisition.unit == "µm"
@@ -69,8 +80,61 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     assert image.axis_labels == ("y", "x")
     assert still.axis_labels == ("t", "y", "x")
     assert [str(unit) for unit in image.units] == ["micrometer", "micrometer"]
-    for own in ("frame outlines", "frame centres"):
+    for own in ("outlines", "path"):
         np.testing.assert_allclose(viewer.layers[f"run 1: {own}"].scale, [1, 0.5, 0.25])
+
+
+@pytest.fixture
+def ome_file(tmp_path, simulated):
+    """Return a file of two channels, half a micrometre by a quarter a pixel, a frame each 0.2 s."""
+    path = tmp_path / "recorded.ome.tif"
+    told = {
+        "axes": "TCYX",
+        "PhysicalSizeY": 0.5,
+        "PhysicalSizeX": 0.25,
+        "TimeIncrement": 0.2,
+        "Channel": {"Name": ["red", "green"]},
+    }
+    tifffile.imwrite(path, simulated.arrays()["frames"][..., :2].transpose(0, 3, 1, 2), metadata=told)
+    return path
+
+
+def test_what_an_ome_tiff_says_is_in_results_although_napari_opens_it(
+    open_dock, run_through, npe2pm, ome_file, tmp_path
+):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock()
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    np.testing.assert_array_equal(layer.scale, [1, 1, 0.5, 0.25])
+    run = run_through(dock)
+    known = run.result.acquisition
+    assert (known.pixel_size, known.unit) == ((0.5, 0.25), "µm")
+    assert known.channel_names == ("red", "green")
+    np.testing.assert_allclose(known.times, 0.2 * np.arange(8))
+    image = viewer.layers["run 1: image"]
+    np.testing.assert_array_equal(image.scale[-2:], [0.5, 0.25])
+    assert [str(unit) for unit in image.units[-2:]] == ["micrometer", "micrometer"]
+    dock.runs.save_result(run, tmp_path / "out.ome.tif")
+    written = read_burst(tmp_path / "out.ome.tif", axes="CYX")
+    assert (written.pixel_size, written.unit) == ((0.5, 0.25), "µm")
+    assert written.channel_names == ("red", "green")
+
+
+def test_a_file_moves_no_layer_apart_from_those_that_lie_over_it(open_dock, npe2pm, ome_file):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock(Shapes([np.array([[5.0, 8.0], [5.0, 47.0], [40.0, 47.0], [40.0, 8.0]])]))
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    np.testing.assert_array_equal(layer.scale, 1)
+    assert dock.input.source().read().pixel_size == (0.5, 0.25)
+
+
+def test_what_a_file_says_of_other_frames_is_left_out(open_dock, npe2pm, ome_file):
+    npe2pm.register(PluginManifest.from_distribution("napari"))
+    viewer, dock = open_dock()
+    (layer,) = viewer.open(str(ome_file), plugin="napari")
+    layer.data = layer.data[2:, :1]
+    burst = dock.input.source().read()
+    assert (burst.times, burst.channel_names) == (None, ())
 
 
 @pytest.mark.parametrize("order", ["TCYX", "CTYX"])
@@ -83,6 +147,7 @@ def test_channels_that_are_no_colours_stay_an_axis(open_dock, run_through, simul
     expected = np.moveaxis(run.result.image, 2, 0)
     shown = image.data if order == "TCYX" else image.data[:, 3]
     np.testing.assert_array_equal(shown, expected)
+    switch_on(dock, "stabilised burst")
     assert viewer.layers["run 1: stabilised burst"].data.shape == viewer.layers[0].data.shape
 
 
@@ -99,11 +164,17 @@ def test_grey_layers_make_one_burst(open_dock, run_through, qtbot, simulated):
     assert run.result.acquisition.channel_names == names
     for number, name in enumerate(names):
         np.testing.assert_array_equal(viewer.layers[f"run 1: image of {name}"].data, run.result.image[..., number])
+    switch_on(dock, "stabilised burst")
+    for name in names:
+        assert viewer.layers[f"run 1: stabilised burst of {name}"].data.shape == (8, 63, 75)
+    dock.display.card.switches["stabilised burst"].setChecked(False)
+    assert not [layer for layer in viewer.layers if "stabilised" in layer.name]
 
 
 def test_a_dask_layer_is_a_burst(open_dock, run_through, grey_frames):
     viewer, dock = open_dock(Image(da.from_array(grey_frames, chunks=(1, 63, 75))))
     assert run_through(dock).result.image.shape == (63, 75)
+    switch_on(dock, "stabilised burst")
     still = viewer.layers["run 1: stabilised burst"].data
     assert isinstance(still, da.Array)
     np.testing.assert_array_equal(still[0].compute(), grey_frames[0])
@@ -129,7 +200,8 @@ def test_axes_of_length_one_in_front_are_no_hindrance(open_dock, run_through, gr
     viewer, dock = open_dock(Image(grey_frames[None, None]))
     run = run_through(dock)
     np.testing.assert_array_equal(viewer.layers["run 1: image"].data, run.result.image)
-    assert viewer.layers["run 1: frame centres"].data.shape == (8, 4)
+    switch_on(dock, "path")
+    assert viewer.layers["run 1: path"].data.shape == (8, 4)
 
 
 @pytest.mark.parametrize("axes", ["TYXQ", "CYXT"])

@@ -15,6 +15,7 @@ from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, 
 from napari_fiberburst.plugin.calls import as_command, as_python
 from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.plugin.history import History, HistoryEntry
+from napari_fiberburst.plugin.pace import Pace
 from napari_fiberburst.plugin.placement import Placement, as_colour, limits_of
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
 from napari_fiberburst.results.reconstruction import Canvas
@@ -103,7 +104,7 @@ def test_axes_region_and_channels_are_in_the_call():
     turned = source(path="b.tif", axes="CTYX", region=((1, 20), (2, 30)), arrays=(np.zeros((2, 5, 31, 37)),))
     assert "Burst(viewer.layers['a'].data, axes='CTYX').crop((1, 20), (2, 30))" in as_python(turned, {})
     assert "--axes CTYX --crop 1:20,2:30" in as_command(turned, {})
-    several = source(names=("r", "g"), arrays=(np.zeros((5, 31, 37)),) * 2)
+    several = source(names=("r", "g"), channel_names=("r", "g"), arrays=(np.zeros((5, 31, 37)),) * 2)
     assert (
         "Burst([viewer.layers['r'].data, viewer.layers['g'].data], axes='CTYX', channel_names=('r', 'g'))"
         in as_python(several, {})
@@ -114,12 +115,12 @@ def test_axes_region_and_channels_are_in_the_call():
 def test_a_simulated_burst_is_simulated_by_its_command():
     text = as_command(source(recipe={"scene": "cat", "physics": "core"}), {"preset": "paper"})
     assert text.splitlines() == [
-        "fiberburst simulate --scene cat --physics core -o burst.npz",
-        "fiberburst reconstruct burst.npz -o image.ome.tif --preset paper",
+        "fiberburst simulate --scene cat --physics core -o simulated.burst",
+        "fiberburst reconstruct simulated.burst -o image.ome.tif --preset paper",
     ]
     faulty = {"scene": "cat", "deformation_length": 40.0, "overlay": True}
     assert as_command(source(recipe=faulty), {}).startswith(
-        "fiberburst simulate --scene cat --deformation-length 40.0 --overlay -o burst.npz\n"
+        "fiberburst simulate --scene cat --deformation-length 40.0 --overlay -o simulated.burst\n"
     )
 
 
@@ -133,6 +134,25 @@ def test_history_keeps_the_first_the_newest_and_an_even_part_between():
     assert len(seconds) <= 10
     assert seconds[0] == 0
     assert len(set(np.diff(seconds[:-1]))) == 1
+
+
+def test_one_slow_drawing_holds_up_no_more_than_the_next_two():
+    pace = Pace(0.1)
+    assert pace.is_due(0.0)
+    pace.note(0.0, 0.05)
+    pace.note(1.0, 4.0)  # the first layer of its kind
+    assert pace.is_due(4.5)
+    assert not pace.is_due(4.4)
+    pace.note(5.0, 5.05)
+    assert pace.is_due(5.55)
+
+
+def test_drawings_that_are_all_slow_come_every_two_seconds():
+    pace = Pace(0.1)
+    for began in (0.0, 3.0, 6.0):
+        pace.note(began, began + 1.0)
+        assert not pace.is_due(began + 1.0 + 1.9)
+        assert pace.is_due(began + 1.0 + 2.0)
 
 
 def test_a_turned_layer_has_its_image_in_the_same_place():

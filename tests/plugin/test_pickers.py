@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 from napari.layers import Image
+from pyqtgraph import PlotWidget
 from qtpy.QtCore import QPoint, QPointF, Qt
 from qtpy.QtGui import QWheelEvent
-from qtpy.QtWidgets import QApplication
+from qtpy.QtWidgets import QApplication, QScrollArea, QSlider, QWidget
 
 from napari_fiberburst.plugin.pickers import LayerPicker
 
@@ -90,17 +91,24 @@ def turn_wheel(widget):
     QApplication.sendEvent(widget, event)
 
 
-def test_the_wheel_turns_no_box_that_has_no_focus(open_dock, burst_layer, monkeypatch):
-    _, dock = open_dock(burst_layer)
+def test_the_wheel_scrolls_the_dock_and_turns_nothing(open_dock, run_through, burst_layer, monkeypatch):
+    viewer, dock = open_dock(burst_layer)
+    run_through(dock)
+    viewer.window.resize(1000, 400)
+    dock.display.curve_box.expand(animate=False)
+    monkeypatch.setattr(QWidget, "hasFocus", lambda _: True)
     number, box = dock.form.rows["upsample"].editor.native, dock.form.boxes["motion"]
-    before = number.value(), box.currentIndex()
-    for widget in (number, box):
+    plots = dock.display.curve_box.findChildren(PlotWidget)
+    (slider,) = dock.display.slider.findChildren(QSlider)
+    bar = dock.findChild(QScrollArea).verticalScrollBar()
+    bar.setRange(0, 1000)
+    before = number.value(), box.currentIndex(), slider.value(), [plot.viewRange() for plot in plots]
+    for widget in (number, box, slider, *(plot.viewport() for plot in plots)):
+        bar.setValue(500)
         turn_wheel(widget)
-        assert widget.focusPolicy() == Qt.FocusPolicy.StrongFocus
-    assert (number.value(), box.currentIndex()) == before
-    monkeypatch.setattr(type(number), "hasFocus", lambda _: True)
-    turn_wheel(number)
-    assert number.value() > before[0]
+        assert bar.value() < 500
+    assert (number.value(), box.currentIndex(), slider.value(), [plot.viewRange() for plot in plots]) == before
+    assert {widget.focusPolicy() for widget in (number, box, slider)} == {Qt.FocusPolicy.StrongFocus}
 
 
 def test_no_editor_widens_the_dock(open_dock, burst_layer, grey_frames):

@@ -1,10 +1,13 @@
 """The runner's signals, whatever the job does."""
 
+import subprocess
+import sys
 import threading
 
 import pytest
 from napari.utils import progress
-from qtpy.QtCore import QThreadPool, QTimer
+from qtpy.compat import isalive
+from qtpy.QtCore import QCoreApplication, QEvent, QThreadPool, QTimer
 
 from napari_fiberburst.control import Control
 from napari_fiberburst.plugin.runner import Runner
@@ -97,6 +100,49 @@ def test_closed(qtbot, runner, seen):
     assert not progress._all_instances
     qtbot.waitUntil(lambda: job.is_released, timeout=MILLISECONDS)
     assert seen == ["started"]
+
+
+def test_closed_after_qt_has_deleted_the_workers_signals(qtbot, runner, seen):
+    """As it happens where napari is closed while a run goes."""
+    job = WaitingJob()
+    runner.start(job, "a run")
+    job.control.stop()
+    QThreadPool.globalInstance().waitForDone()
+    signals = runner._worker.signals
+    signals.deleteLater()
+    QCoreApplication.sendPostedEvents(signals, QEvent.Type.DeferredDelete.value)
+    assert not isalive(signals)
+    runner.shut_down()
+    assert runner.state == "ready"
+    assert not progress._all_instances
+    assert seen == ["started"]
+
+
+def test_python_may_end_while_a_run_goes():
+    """The worker's last signals are sent before Qt's objects go."""
+    code = """
+import sys, time
+from napari_fiberburst.control import Control
+from napari_fiberburst.plugin.runner import Runner
+from napari_fiberburst.streaming import Latest
+from qtpy.QtWidgets import QApplication
+
+class SlowJob:
+    control, reports, previews, result = Control(), Latest(), Latest(), None
+
+    def run(self, should_stop):
+        while not self.control.stopped:
+            time.sleep(0.05)
+        time.sleep(0.5)  # the step it is in
+        print("done")
+
+app = QApplication(sys.argv)
+runner = Runner()
+runner.start(SlowJob(), "a run")
+app.processEvents()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (ended.stdout, ended.stderr) == ("done\n", "")
 
 
 def test_only_one_at_a_time(qtbot, runner):

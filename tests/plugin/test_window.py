@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 from npe2 import PluginManifest
 from qtpy.QtGui import QAction
-from qtpy.QtWidgets import QMenu
+from qtpy.QtWidgets import QMenu, QPushButton, QScrollArea
 from skimage.io import imread
+
+from napari_fiberburst.plugin.dock import FiberBurstWidget
 
 
 def trigger(window: QMenu, *path: str) -> None:
@@ -35,6 +37,11 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
     qtbot.wait(200)
     after = viewer.window.screenshot(canvas_only=True, flash=False)
     assert dock.runs.run.result.ending == "finished"
+    # All of the way from the burst to what came of it is in sight.
+    viewer.window.resize(1280, 800)
+    seen = dock.findChild(QScrollArea)
+    qtbot.waitUntil(lambda: seen.verticalScrollBar().maximum() == 0)
+    qtbot.waitUntil(lambda: seen.widget().width() <= seen.viewport().width())
     # The honeycomb's dark gaps are gone from what is on the screen.
     assert dark(after) < 0.5 * dark(before)
     folder = Path(os.environ.get("FIBERBURST_SCREENSHOTS", tmp_path))
@@ -47,6 +54,20 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
             path = folder / f"plugin_{theme}_{width}x{height}.png"
             viewer.window.screenshot(str(path), canvas_only=False, flash=False)
             assert imread(path).shape[:2] == (height, width)
+
+
+def test_the_dock_is_as_wide_as_what_is_in_it_in_a_small_window(make_napari_viewer, qtbot):
+    viewer = make_napari_viewer(show=True)
+    viewer.window.resize(800, 600)
+    dock = FiberBurstWidget(viewer)
+    viewer.window.add_dock_widget(dock, name="fiber burst")
+    viewer.window.resize(800, 600)
+    content, seen = dock.findChild(QScrollArea).widget(), dock.findChild(QScrollArea).viewport()
+    qtbot.wait(300)
+    qtbot.waitUntil(lambda: content.minimumSizeHint().width() <= seen.width())
+    qtbot.waitUntil(lambda: content.width() <= seen.width())
+    for button in dock.findChildren(QPushButton):
+        assert button.isHidden() or button.width() >= button.minimumSizeHint().width()
 
 
 def dark(image: np.ndarray) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from napari_fiberburst.cli.arguments import add_parameter, parse_shape
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.folder import read_image
+from napari_fiberburst.io.read import SIMULATED_ENDING
 from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.settings.parameter import parameters_of
 from napari_fiberburst.simulation import MOTIONS, SCENES, Faults, simulate
@@ -24,9 +25,9 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "simulate",
         help="make a burst with known truth",
-        description="Simulate a burst: frames as recorded, and the truth behind them, in one npz file.",
+        description="Simulate a burst: frames as recorded, and the truth behind them, in one .burst file.",
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, help="a file ending in .npz")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a file ending in .burst")
     parser.add_argument("--scene", choices=SCENES, default="histology", help="what there is to see")
     parser.add_argument("--shape", type=parse_shape, metavar="HxW", help="default 256x256, or that of --flat")
     parser.add_argument("--frames", type=int, default=20, help="default 20")
@@ -46,8 +47,10 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Simulate and write."""
-    if options.output.suffix != ".npz":
-        raise OutputError(f"a simulated burst is written with its truth to a .npz file; got {options.output}")
+    if options.output.suffix != SIMULATED_ENDING:
+        raise OutputError(
+            f"a simulated burst is written with its truth to a {SIMULATED_ENDING} file; got {options.output}"
+        )
     check_place(options.output)
     simulated = simulate(
         options.scene,

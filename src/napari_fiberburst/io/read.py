@@ -15,8 +15,12 @@ from napari_fiberburst.io.zarr import is_zarr, read_zarr
 
 _FORMATS = (
     "a TIFF stack (.tif, .tiff, .ome.tif), a folder of PNG or TIFF frames, a pattern such as 'frames/*.png', "
-    "a .npz file, or OME-Zarr (.zarr)"
+    "a simulated burst (.burst), a .npz file, or OME-Zarr (.zarr)"
 )
+# Of a simulated burst with its truth: numpy's archive, under a name that no other reader of napari's claims. Earlier
+# versions wrote .npz, which napari opens by itself, and not as a burst.
+SIMULATED_ENDING = ".burst"
+ARCHIVE_ENDINGS = (SIMULATED_ENDING, ".npz")
 
 _NPZ_SCALARS = ("axes", "black_level", "white_level")
 
@@ -34,8 +38,9 @@ def read_burst(
     ----------
     path : str or Path
         A multi-page TIFF or OME-TIFF; a folder of PNG or TIFF frames, or a pattern such as ``frames/*.png``, taken in
-        natural order (2 before 10); a ``.npz`` file with only one array, or with an array "frames" (and, where they
-        are known, "axes", "black_level" and "white_level"); an OME-Zarr image (needs the extra ``zarr``).
+        natural order (2 before 10); a ``.burst`` file of a simulated burst, or a ``.npz`` file with only one
+        array, or with an array "frames" (and, where they are known, "axes", "black_level" and "white_level"); an
+        OME-Zarr image (needs the extra ``zarr``).
     axes : str, optional
         Order of the axes, where the file does not say it or is wrong.
     black_level, white_level : float, optional
@@ -80,12 +85,12 @@ def _open(path: Path) -> Recording:
         return read_images([item for item in found if item.is_file()], f"the folder {path}")
     if path.suffix.lower() in TIFF_ENDINGS:
         return read_tiff(path)
-    if path.suffix.lower() == ".npz":
-        return _read_npz(path)
+    if path.suffix.lower() in ARCHIVE_ENDINGS:
+        return _read_archive(path)
     raise BurstError(f"{path} is of no kind that can be read; expected {_FORMATS}")
 
 
-def _read_npz(path: Path) -> Recording:
+def _read_archive(path: Path) -> Recording:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             names = list(arrays)

@@ -42,6 +42,23 @@ def read_tiff(path: Path) -> Recording:
         raise BurstError(f"{path} cannot be read as TIFF ({error}); copy or export it again") from error
 
 
+def describe_tiff(path: Path) -> dict[str, Any]:
+    """Return what a TIFF file says beside its pixels, by the names that `Recording` has; {} where it says nothing.
+
+    Raises
+    ------
+    BurstError
+        It is no TIFF.
+    """
+    try:
+        with tifffile.TiffFile(path) as file:
+            series = file.series[0]
+            axes = with_time(series.axes)
+            return _described(file, series.shape[axes.index("T")] if "T" in axes else 1)
+    except Exception as error:  # as in `read_tiff`
+        raise BurstError(f"{path} cannot be read as TIFF ({error}); copy or export it again") from error
+
+
 def _is_cut_short(file: tifffile.TiffFile) -> bool:
     """Whether pages or pixels that the file points to are not in it.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.data.burst import MIN_SIDE, Burst
 from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
-from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 _LABELS = {"t": "T", "time": "T", "frame": "T", "c": "C", "channel": "C", "y": "Y", "x": "X", "z": "Z"}
 _PIXEL_UNITS = ("pixel", "dimensionless")
@@ -53,6 +53,10 @@ class BurstSource:
         Height and width of a pixel, in `unit`.
     unit : str or None
         Unit of length.
+    channel_names : tuple of str
+        One per channel; empty where they are not known.
+    times : tuple of float or None
+        Seconds at which the frames were taken.
     words : tuple of str
         How each array is called in napari's console.
     path : str or None
@@ -69,6 +73,8 @@ class BurstSource:
     region: Region | None = None
     pixel_size: tuple[float, float] | None = None
     unit: str | None = None
+    channel_names: tuple[str, ...] = ()
+    times: tuple[float, ...] | None = None
     words: tuple[str, ...]
     path: str | None = None
     recipe: dict[str, Any]
@@ -125,9 +131,10 @@ class BurstSource:
         """
         burst = Burst(
             self._whole(),
-            channel_names=self.names if len(self.arrays) > 1 else (),
+            channel_names=self.channel_names,
             pixel_size=self.pixel_size,
             unit=self.unit,
+            times=self.times,
         )
         return burst if self.region is None else burst.crop(*self.region)
 
@@ -152,7 +159,14 @@ def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) 
     first = layers[0]
     metadata = first.metadata.get(METADATA_KEY, {}) if len(layers) == 1 else {}
     truth = _truth(metadata, data_of(first), axes)
+    recording = first.metadata.get(METADATA_KEY, {}).get(RECORDING_KEY, {})
     pixel_size, unit = _pixel_size(first, axes)
+    if pixel_size is None:
+        pixel_size, unit = recording.get("pixel_size"), recording.get("unit")
+    sizes = dict(zip(axes, data_of(first).shape, strict=False))
+    names, times = recording.get("channel_names", ()), recording.get("times", ())
+    if len(layers) > 1:
+        names, sizes["C"] = [layer.name for layer in layers], len(layers)
     return BurstSource(
         names=tuple(layer.name for layer in layers),
         arrays=tuple(data_of(layer) for layer in layers),
@@ -160,6 +174,9 @@ def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) 
         region=region,
         pixel_size=pixel_size,
         unit=unit,
+        # Of no use where the data or the order of the axes have been changed since.
+        channel_names=tuple(names) if len(names) == sizes.get("C", 1) else (),
+        times=tuple(times) if times and len(times) == sizes.get("T") else None,
         words=tuple(words_of(layer) for layer in layers),
         path=_path(first, metadata) if len(layers) == 1 else None,
         recipe={} if truth is None else dict(metadata.get("recipe", {})),

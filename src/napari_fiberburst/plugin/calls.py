@@ -45,7 +45,7 @@ def as_command(source: BurstSource, choices: Mapping[str, Any], bundle: BundleSo
     path = source.path
     lines = []
     if path is None and source.recipe:
-        path = "burst.npz"
+        path = "simulated.burst"
         options = [word for name, value in source.recipe.items() for word in _option(name, value)]
         lines.append(shlex.join(["fiberburst", "simulate", *options, "-o", path]))
     elif path is None:
@@ -84,7 +84,8 @@ def _burst_call(source: BurstSource) -> str:
     several = len(source.words) > 1
     frames = f"[{', '.join(source.words)}]" if several else source.words[0]
     known: dict[str, Any] = {"axes": f"C{source.axes}" if several else source.axes}
-    known |= {"channel_names": source.names} if several else {}
+    known |= {"channel_names": source.channel_names} if source.channel_names else {}
+    known |= {"times": source.times} if source.times is not None else {}
     known |= {"pixel_size": source.pixel_size, "unit": source.unit} if source.pixel_size is not None else {}
     burst = f"Burst({', '.join([frames, *(f'{name}={value!r}' for name, value in known.items())])})"
     return burst if source.region is None else f"{burst}.crop{source.region!r}"

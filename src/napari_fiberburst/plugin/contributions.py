@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tifffile
 
-from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.io.read import ARCHIVE_ENDINGS
+from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.burst import Burst
@@ -70,13 +71,13 @@ retina_round = partial(make_sample, "retina", "core", field=0.95, overlay=True, 
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
-    """Return a reader for a folder of frames, an npz burst or a bundle, None for anything else."""
+    """Return a reader for a folder of frames, a simulated burst or a bundle, None for anything else."""
     if not isinstance(path, str):
         return None
     place = Path(path)
     if place.suffix.lower() == ".bundle":
         return read_bundle
-    is_burst = place.suffix.lower() == ".npz" or (place.is_dir() and _holds_frames(place))
+    is_burst = place.suffix.lower() in ARCHIVE_ENDINGS or (place.is_dir() and _holds_frames(place))
     return read if is_burst else None
 
 
@@ -132,7 +133,8 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
     )
     if frames.ndim == 4 and not look["rgb"]:
         frames = frames.transpose(0, 3, 1, 2)  # napari draws the last two axes
-    look["metadata"][METADATA_KEY]["shape"] = frames.shape
+    recording = {"channel_names": burst.channel_names, "times": () if burst.times is None else burst.times.tolist()}
+    look["metadata"][METADATA_KEY] |= {"shape": frames.shape, RECORDING_KEY: recording}
     return [(frames, look, "image")]
 
 
@@ -225,7 +227,7 @@ def _truth_in(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
 def _truth(path: Path) -> dict[str, Any]:
     """Return the truth that a simulated burst's file carries."""
-    if path.suffix.lower() != ".npz":
+    if path.suffix.lower() not in ARCHIVE_ENDINGS:
         return {}
     with np.load(path, allow_pickle=False) as arrays:
         if not {"truth", "homographies"} <= set(arrays):

@@ -57,7 +57,7 @@ class Curves(QWidget):
         self.follow_theme()
 
     def clear(self) -> None:
-        """Forget the run before."""
+        """Make way for another run."""
         self._drawn = 0
         for line in self._lines.values():
             line.setData([], [])
@@ -109,6 +109,9 @@ def _plot(label: str, *, log: bool = False) -> pyqtgraph.PlotWidget:
     plot.setLabel("bottom", "seconds")
     plot.addLegend(offset=(-5, 5), labelTextSize="8pt")
     plot.setMenuEnabled(False)
+    # All of a curve is always in sight: what the mouse could move, nothing here would bring back.
+    plot.setMouseEnabled(x=False, y=False)
+    plot.hideButtons()
     return plot
 
 

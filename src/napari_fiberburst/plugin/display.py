@@ -1,16 +1,15 @@
 """What a run shows while it goes and when it is done: its state in words, its image, its curves, its past."""
 
-from collections.abc import Iterator
 from contextlib import suppress
-from itertools import chain
 from typing import TYPE_CHECKING
 
 from napari.components import ViewerModel
-from qtpy.QtCore import QObject, Qt, QTimer, Signal
+from qtpy.QtCore import QObject, Qt, Signal
 from qtpy.QtGui import QMovie
 from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
 from superqt import QLabeledSlider
 
+from napari_fiberburst.plugin.card import ResultCard
 from napari_fiberburst.plugin.curves import Curves
 from napari_fiberburst.plugin.history import HistoryEntry
 from napari_fiberburst.plugin.job import Job
@@ -18,20 +17,23 @@ from napari_fiberburst.plugin.runs import KeptRun
 from napari_fiberburst.plugin.sections import section
 
 if TYPE_CHECKING:
-    from napari_fiberburst.results.diagnostics import Quality
     from napari_fiberburst.results.progress import Progress
 
-# Of a verdict; they are told apart by their words too.
-_COLOURS = {"good": "#3fa34d", "doubtful": "#d9822b", "bad": "#d64545"}
 # Per cent of an animation's own pace.
 _SLOW, _USUAL = 4, 100
+_ENDINGS = {
+    "finished": "is finished",
+    "stopped": "was stopped, and keeps what it has come to",
+    "time budget": "has used up its time",
+    "diverged": "came to no numbers, and keeps its last good image",
+}
 _NOTHING_YET = "Choose a burst and press Start."
 
 
 class Display(QObject):
     """Shows the run that is going, then its result; and the past of the run that is selected.
 
-    Its widgets stand in the dock where they belong: `status_box`, `curve_box` and `past_box`.
+    Its widgets stand in the dock where they belong: `status_box`, `card`, `curve_box` and `past_box`.
 
     Parameters
     ----------
@@ -41,7 +43,7 @@ class Display(QObject):
         Who owns it.
     """
 
-    complete = Signal(object)  # the KeptRun whose last layer has been added
+    complete = Signal(object)  # the KeptRun whose result is shown
 
     def __init__(self, viewer: ViewerModel, parent: QObject) -> None:
         super().__init__(parent)
@@ -50,20 +52,15 @@ class Display(QObject):
         self.bar = QProgressBar()
         self.slider = QLabeledSlider()
         self._curves = Curves(viewer)
+        self.card = ResultCard(viewer)
         self.curve_box = section("Curves", self._curves)
         self.status_box, self.past_box = self._lay_out()
         self._selected: KeptRun | None = None
-        self._points: tuple[Job, float] | None = None
-        self._layers_to_come: Iterator[None] = iter(())
-        self._timer = QTimer(self)
-        self._timer.setInterval(0)
-        self._timer.timeout.connect(self._add_layer)
         self.slider.valueChanged.connect(self._scrub)
         self.curve_box.toggled.connect(lambda _: self._draw_curves())
 
     def begin(self) -> None:
         """Make way for a new run."""
-        self._curves.clear()
         # No moving bar for "busy": where the canvas is drawn in software, every repaint takes time from the fit.
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
@@ -82,40 +79,44 @@ class Display(QObject):
         if job.acquisition is None:
             return
         run.layers.show_frames(report.homographies, job.acquisition.shape[1:3])
-        self._points = job, job.acquisition.white_level - job.acquisition.black_level
+        self.card.refresh()
+        run.span = job.acquisition.white_level - job.acquisition.black_level
         self._draw_curves()
         self.bar.setRange(0, report.iterations)
         self.bar.setValue(report.step)
         self.status.setText(_status(report))
 
     def end(self, run: KeptRun, job: Job) -> None:
-        """Show the result of a run, layer by layer; then say so."""
+        """Show the result of a run; then say so."""
         result = job.result
         if result is None:
             return
         run.result = result
         run.scores = next((point.scores for point in reversed(job.curve) if point.scores is not None), None)
         self._draw_curves()
-        self._points = None
-        notes = f"; {len(result.notes)} notes, see Runs" if result.notes else ""
-        self.status.setText(f"{run.name}: {_verdict(result.quality)}{result.ending} in {result.seconds:.1f} s{notes}")
-        self._layers_to_come = chain(
-            self._layers_to_come, run.layers.finish(result, run.source.frames), self._say_complete(run)
-        )
-        self._timer.start()
+        self.status.setText(f"{run.name} {_ENDINGS[result.ending]}.")
+        run.layers.finish(result, run.source.frames)
+        self.card.refresh()
+        self.complete.emit(run)
 
     def fail(self) -> None:
         """Say that a run came to nothing."""
-        self._points = None
         self.status.setText("The run failed. Change the settings or the burst, and press Start.")
 
     def select(self, run: KeptRun | None) -> None:
-        """Let the history be that of a run, at its newest image; one that was gone back through shows it again."""
+        """Let curves and history be those of a run, at its newest image.
+
+        One that was gone back through shows that image again.
+        """
         before = self._selected
         if before is not None and before.result is not None and self.slider.value() < self.slider.maximum():
             result = before.result
             before.layers.show_image(result.image, result.acquisition, result.canvas)
         self._selected = run
+        if run is not before:
+            self.card.show_run(run)
+            self._curves.clear()
+            self._draw_curves()
         self.slider.blockSignals(True)
         self.slider.setMaximum(0 if run is None else max(0, len(run.history.entries) - 1))
         self.slider.setValue(self.slider.maximum())
@@ -123,12 +124,13 @@ class Display(QObject):
 
     def shut_down(self) -> None:
         """Show nothing more. May be called more than once."""
-        self._timer.stop()
         self._curves.shut()
+        self.card.shut()
 
     def open(self) -> None:
         """Show again, where it was shut down."""
         self._curves.open()
+        self.card.open()
 
     def _lay_out(self) -> tuple[QWidget, QWidget]:
         self.bar.setTextVisible(False)
@@ -146,19 +148,10 @@ class Display(QObject):
         row.addWidget(self.slider)
         return state, past
 
-    def _add_layer(self) -> None:
-        """Add the next layer that waits; the window handles its events between two of them."""
-        if next(self._layers_to_come, self) is self:
-            self._timer.stop()
-
-    def _say_complete(self, run: KeptRun) -> Iterator[None]:
-        self.complete.emit(run)
-        yield
-
     def _draw_curves(self) -> None:
-        if self._points is not None and self.curve_box.isExpanded():
-            job, span = self._points
-            self._curves.show_points(job.curve, span)
+        run = self._selected
+        if run is not None and self.curve_box.isExpanded():
+            self._curves.show_points(run.curve, run.span)
 
     def _scrub(self, index: int) -> None:
         """Show an image of the past."""
@@ -200,8 +193,3 @@ def _status(report: "Progress") -> str:
     if report.loss == report.loss:  # not NaN, as before the frames are registered
         parts.append(f"loss {report.loss:.3g}")
     return " · ".join(parts)
-
-
-def _verdict(quality: "Quality | None") -> str:
-    """Return the verdict as a coloured word, for a label that knows HTML."""
-    return "" if quality is None else f'<b style="color: {_COLOURS[quality]}">{quality}</b>, '

@@ -1,5 +1,6 @@
 """The dock widget "Fiber burst reconstruction"."""
 
+import atexit
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -7,11 +8,10 @@ from itertools import count
 from typing import TYPE_CHECKING, Any
 
 from napari.utils.notifications import show_error
-from qtpy.QtCore import QEvent, QSize, Qt
+from qtpy.QtCore import QEvent, QSize
 from qtpy.QtWidgets import (
     QLabel,
     QPushButton,
-    QScrollArea,
     QVBoxLayout,
     QWidget,
 )
@@ -24,6 +24,7 @@ from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
 from napari_fiberburst.plugin.calls import as_python
 from napari_fiberburst.plugin.copying import CopyButtons
+from napari_fiberburst.plugin.departures import Departures
 from napari_fiberburst.plugin.display import AnimationThrottle, Display
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
@@ -31,10 +32,10 @@ from napari_fiberburst.plugin.job import Job, load_solver
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.placement import Placement
-from napari_fiberburst.plugin.preferences import preferences, remember, remembered
-from napari_fiberburst.plugin.runner import Runner
+from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
+from napari_fiberburst.plugin.runner import Runner, wait_for_workers
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
-from napari_fiberburst.plugin.sections import row_of
+from napari_fiberburst.plugin.sections import Column, row_of, section
 from napari_fiberburst.settings import SplineMethod, choose
 
 if TYPE_CHECKING:
@@ -65,7 +66,6 @@ class FiberBurstWidget(QWidget):
         self._missing: dict[str, str] | None = None
         self._throttle = AnimationThrottle()
         self._is_network = False
-        self._wheel_filter = WheelFilter(self)
         self.input = InputBox(viewer)
         self.form = SettingsForm()
         self.runner = Runner(self)
@@ -76,12 +76,15 @@ class FiberBurstWidget(QWidget):
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
         self.copying = CopyButtons(self.input, self.form)
+        self.departures = Departures()
+        self._burst: Layer | None = None
         self._preferences = preferences()
         self.form.set_choices(remembered(self._preferences))
         self._lay_out()
         self._connect()
         self._follow_state("ready")
         self._estimate()
+        self.departures.begin_anew()
         self._warm_up()
 
     def start(self) -> None:
@@ -161,7 +164,9 @@ class FiberBurstWidget(QWidget):
             bundle=None if bundle is None else bundle.given,
             initial=initial,
         )
-        self._run = KeptRun(name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle)
+        self._run = KeptRun(
+            name=name, python=python, source=source, choices=choices, layers=layers, bundle=bundle, curve=job.curve
+        )
         self._shown_at_end = "image"
         self.display.begin()
         self.runs.add(self._run)
@@ -187,9 +192,10 @@ class FiberBurstWidget(QWidget):
             self.runs.refresh()
 
     def _show_what_was_asked(self, run: KeptRun) -> None:
-        """Hide the image where something else of a result was asked for, now that all is there."""
+        """Show something else of a result than its image, where that was asked for."""
         if run is self._run and self._shown_at_end != "image":
-            run.layers.set_visible(self._shown_at_end, True)
+            run.layers.switch(self._shown_at_end, True)
+            self.display.card.refresh()
             run.layers.set_visible("image", False)
 
     def _fail(self, problem: str) -> None:
@@ -215,6 +221,7 @@ class FiberBurstWidget(QWidget):
         self.pause_button.setText("Continue" if state == "paused" else "Pause")
         self.stop_button.setEnabled(state in ("running", "paused"))
         self.input.set_enabled(is_ready)
+        self.departures.set_enabled(is_ready)
         self.form.set_running(not is_ready, is_network=self._is_network)
         self.runs.set_running(not is_ready)
         self.display.slider.setEnabled(is_ready)
@@ -247,11 +254,21 @@ class FiberBurstWidget(QWidget):
         run.turned_live.append((seconds, name, value))
         run.layers.tell("turned_live", list(run.turned_live))
 
+    def _take_input(self) -> None:
+        if self.input.burst.value is not self._burst:
+            self._burst = self.input.burst.value
+            self.departures.begin_anew()
+        self._estimate()
+
+    def _set_back(self) -> None:
+        self.form.set_choices(usual(self._preferences))
+
     def _estimate(self) -> None:
         """Say how much memory the run will take, and keep the choices."""
         self._memory.setText("")
         with suppress(FiberBurstError):
             choices = self.form.choices()
+            self.departures.take_choices(choices, usual(self._preferences))
             remember(choices, self._preferences)
             self._memory.setText(in_words(self.input.source(), choices, self._missing))
 
@@ -267,6 +284,7 @@ class FiberBurstWidget(QWidget):
 
         The worker is superqt's, because napari shows its own as activity and asks before it closes.
         """
+        atexit.register(wait_for_workers)
         create_worker(load_solver, _connect={"returned": self._take_missing}, _ignore_errors=True)
 
     def _take_missing(self, missing: dict[str, str]) -> None:
@@ -281,31 +299,37 @@ class FiberBurstWidget(QWidget):
         content = QWidget()
         column = QVBoxLayout(content)
         column.addWidget(self.input)
+        column.addWidget(self.departures)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
         column.addWidget(self.display.status_box)
-        column.addWidget(self.form)
-        column.addWidget(self._memory)
-        column.addWidget(self.copying)
+        column.addWidget(self.display.card)
+        column.addWidget(section("Settings", self._settings()))
         column.addWidget(self.display.curve_box)
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
         column.addStretch(1)
-        self._wheel_filter.protect(content)
-        scroll = QScrollArea()
-        scroll.setWidgetResizable(True)
-        scroll.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        scroll.setFrameShape(QScrollArea.Shape.NoFrame)
-        scroll.setWidget(content)
+        scroll = Column(content)
+        WheelFilter(scroll)
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addWidget(scroll)
+
+    def _settings(self) -> QWidget:
+        """Return what most runs need nothing of."""
+        settings = QWidget()
+        column = QVBoxLayout(settings)
+        column.setContentsMargins(0, 0, 0, 0)
+        for widget in (self.form, self._memory, self.copying):
+            column.addWidget(widget)
+        return settings
 
     def _connect(self) -> None:
         self.start_button.clicked.connect(lambda: self.start())
         self.pause_button.clicked.connect(self._toggle_pause)
         self.stop_button.clicked.connect(self.runner.stop)
         self.copying.copied.connect(self.display.status.setText)
-        self.input.changed.connect(self._estimate)
+        self.input.changed.connect(self._take_input)
+        self.departures.back_asked.connect(self._set_back)
         self.form.changed.connect(self._estimate)
         self.form.turned_live.connect(self._turn_live)
         self.runs.chosen.connect(self.display.select)

@@ -16,6 +16,7 @@ from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, 
 from napari_fiberburst.plugin.contributions import read_bundle
 from napari_fiberburst.plugin.pickers import LayerPicker
 from napari_fiberburst.plugin.placement import Placement
+from napari_fiberburst.plugin.recorded import take_recording
 from napari_fiberburst.plugin.sections import form_layout, row_of, section
 
 _LINES_OF_CHANNELS = 4
@@ -194,7 +195,10 @@ class InputBox(QWidget):
         layer = self.burst.value
         if layer is not self._guessed_for:
             self._guessed_for = layer
-            self.axes.setText("" if layer is None else guess_axes(layer))
+            axes = "" if layer is None else guess_axes(layer)
+            if layer is not None:
+                take_recording(self._viewer, layer, axes)
+            self.axes.setText(axes)
         self._list_channels()
         self.changed.emit()
 

@@ -7,7 +7,7 @@ from magicgui.widgets import ComboBox
 from napari.components import ViewerModel
 from napari.layers import Layer
 from qtpy.QtCore import QEvent, QObject, Qt
-from qtpy.QtWidgets import QAbstractSpinBox, QComboBox, QWidget
+from qtpy.QtWidgets import QAbstractSpinBox, QApplication, QComboBox, QGraphicsView, QScrollArea, QSlider
 
 _SHORTEST_NAME = 12
 
@@ -49,22 +49,36 @@ class LayerPicker(ComboBox):
 
 
 class WheelFilter(QObject):
-    """Lets the wheel scroll the dock, unless the spin box or combo box under the pointer has the focus."""
+    """Lets the wheel scroll the dock, whatever is under the pointer.
 
-    def protect(self, content: QWidget) -> None:
-        """Watch all spin boxes and combo boxes that are there now."""
-        for kind in (QAbstractSpinBox, QComboBox):
+    Nobody means to turn a setting, or to zoom a plot, by scrolling past it.
+
+    Parameters
+    ----------
+    area : QScrollArea
+        What scrolls.
+    """
+
+    def __init__(self, area: QScrollArea) -> None:
+        super().__init__(area)
+        self._area = area
+        content = area.widget()
+        assert content is not None
+        for kind in (QAbstractSpinBox, QComboBox, QSlider):
             for widget in content.findChildren(kind):
                 widget.setFocusPolicy(Qt.FocusPolicy.StrongFocus)  # the wheel shall not give it the focus either
                 widget.installEventFilter(self)
+        for plot in content.findChildren(QGraphicsView):
+            viewport = plot.viewport()
+            assert viewport is not None
+            viewport.installEventFilter(self)
 
     def eventFilter(self, watched: QObject | None, event: QEvent | None) -> bool:
-        """Pass a wheel event on to what lies around the box."""
+        """Hand a wheel event to the scroll area."""
         if event is None or event.type() != QEvent.Type.Wheel:
             return False
-        if isinstance(watched, QWidget) and watched.hasFocus():
-            return False
-        event.ignore()
+        QApplication.sendEvent(self._area.verticalScrollBar(), event)
+        event.accept()
         return True
 
 

@@ -13,6 +13,8 @@ from napari_fiberburst.data.canvas import Canvas
 
 # Parts of an image's values that are let go below and above when its contrast is set.
 _DARKEST, _BRIGHTEST = 0.1, 99.9
+# Of what `as_colour` returns.
+COLOUR_LIMITS = (0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,6 +39,8 @@ class Placement:
         Row and column of the burst's first pixel in the layer.
     colormaps : tuple
         One for each of its layers; None for rgb.
+    limits : tuple of (float, float)
+        Contrast of each of its layers.
     channels : tuple of str
         The layers' names where each is a channel; empty for a burst in one layer.
     """
@@ -51,6 +55,7 @@ class Placement:
     world_from_data: NDArray[np.float64] | None
     origin: tuple[int, int]
     colormaps: tuple[Any, ...]
+    limits: tuple[tuple[float, float], ...]
     channels: tuple[str, ...]
 
     @classmethod
@@ -73,6 +78,7 @@ class Placement:
             world_from_data=_world_from_data(layer),
             origin=origin,
             colormaps=tuple(None if one.rgb else one.colormap for one in layers),
+            limits=tuple((float(one.contrast_limits[0]), float(one.contrast_limits[1])) for one in layers),
             channels=tuple(one.name for one in layers) if len(layers) > 1 else (),
         )
 

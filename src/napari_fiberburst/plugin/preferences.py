@@ -10,7 +10,7 @@ from qtpy.QtCore import QSettings
 _PLUGIN = "napari-fiberburst"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Preferences:
     """The preferences page, as `napari.yaml` declares it.
 
@@ -38,14 +38,19 @@ def preferences() -> Preferences:
     return Preferences(preset=page.preset, device=page.device, previews_per_second=page.previews_per_second)
 
 
+def usual(wanted: Preferences) -> dict[str, Any]:
+    """Return the choices of a form that nobody has touched."""
+    preset = {} if wanted.preset == Preferences.preset else {"preset": wanted.preset}
+    return preset | ({} if wanted.device == "auto" else {"device": wanted.device})
+
+
 def remembered(wanted: Preferences) -> dict[str, Any]:
     """Return the form's choices as they were left; where the preferences have changed since, those they name."""
-    fresh = {"preset": wanted.preset} | ({} if wanted.device == "auto" else {"device": wanted.device})
     try:
         stored = json.loads(str(_store().value("form", "")))
-        return stored["choices"] if stored["preferences"] == asdict(wanted) else fresh
+        return stored["choices"] if stored["preferences"] == asdict(wanted) else usual(wanted)
     except (ValueError, KeyError, TypeError):
-        return fresh
+        return usual(wanted)
 
 
 def remember(choices: dict[str, Any], wanted: Preferences) -> None:

@@ -1,14 +1,20 @@
 """Runs one job at a time in a worker thread, pauses and stops it, and says how it has ended."""
 
+import atexit
 import io
 import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from napari.qt.threading import FunctionWorker, create_worker
 from napari.utils import progress
-from qtpy.QtCore import QObject, QTimer, Signal
+from qtpy.QtCore import QObject, QThreadPool, QTimer, Signal
 
+from napari_fiberburst.control import Control
 from napari_fiberburst.plugin.job import Job
+from napari_fiberburst.plugin.pace import Pace
 
 if TYPE_CHECKING:
     from napari_fiberburst.results.progress import Progress
@@ -49,10 +55,11 @@ class Runner(QObject):
         self._job: Job | None = None
         self._worker: FunctionWorker[None] | None = None
         self._progress: progress | None = None
+        self._at_exit: Callable[[], None] | None = None
         self._timer = QTimer(self)
         self._timer.setInterval(_MILLISECONDS)
         self._timer.timeout.connect(self._look)
-        self._looked = self._drawn = self._drawing = 0.0
+        self._paces = _paces()
         self._has_image = False
 
     @property
@@ -77,9 +84,10 @@ class Runner(QObject):
         worker.finished.connect(self._end)
         # Where there is no window for it, napari's bar would go to the terminal.
         self._progress = progress(total=1, desc=name, file=io.StringIO())
+        self._at_exit = atexit.register(partial(_end, job.control))
         self._set(state="running")
         self.started.emit(job)
-        self._drawn = self._drawing = 0.0
+        self._paces = _paces()
         self._has_image = False
         self._timer.start()
         worker.start()
@@ -105,9 +113,11 @@ class Runner(QObject):
     def shut_down(self) -> None:
         """Stop for good, without a signal, because the window is closing. May be called more than once."""
         if self._job is not None and self._worker is not None:
-            self._worker.finished.disconnect(self._end)
-            self._worker.finished.connect(self._job.release)
             self._job.control.stop()
+            # Where napari is closing, Qt may have deleted the worker's signals: then none of them can come any more.
+            with suppress(RuntimeError):
+                self._worker.finished.disconnect(self._end)
+                self._worker.finished.connect(self._job.release)
             self._timer.stop()
             self._close_progress()
         self._job = self._worker = None
@@ -118,28 +128,20 @@ class Runner(QObject):
         job, worker = self._job, self._worker
         if job is None or worker is None or worker.abort_requested:
             return
-        now = time.perf_counter()
-        for box, signal, share in (
-            (job.previews, self.previewed, _IMAGES_SHARE),
-            (job.reports, self.reported, _WORDS_SHARE),
-        ):
+        images, words = self._paces
+        for box, signal, pace in ((job.previews, self.previewed, images), (job.reports, self.reported, words)):
             if self._job is not job:
                 return  # napari's progress bar processes events, the end of the run among them
+            began = time.perf_counter()
             # The first image is what a user waits for.
             is_first = box is job.previews and not self._has_image
-            is_due = last or is_first or now - self._drawn >= self._drawing / share
-            report = box.take() if is_due else None
+            report = box.take() if last or is_first or pace.is_due(began) else None
             if report is not None:
                 self._has_image = self._has_image or report.preview is not None
                 signal.emit(report)
                 self._show_progress(report)
-                self._looked = now
                 # Comes back once the window has been drawn.
-                QTimer.singleShot(0, self._note_drawing)
-
-    def _note_drawing(self) -> None:
-        self._drawn = time.perf_counter()
-        self._drawing = self._drawn - self._looked
+                QTimer.singleShot(0, partial(_note_drawing, pace, began))
 
     def _show_progress(self, report: "Progress") -> None:
         bar = self._progress
@@ -156,7 +158,9 @@ class Runner(QObject):
         self._timer.stop()
         self._look(last=True)
         self._close_progress()
-        self._job = self._worker = None
+        if self._at_exit is not None:
+            atexit.unregister(self._at_exit)
+        self._job = self._worker = self._at_exit = None
         self.state = "ready"
         if worker.abort_requested:
             pass  # napari is closing: there may be no window to show anything in
@@ -178,3 +182,24 @@ class Runner(QObject):
     def _set(self, state: State) -> None:
         self.state = state
         self.state_changed.emit(state)
+
+
+def _paces() -> tuple[Pace, Pace]:
+    """Return how often images may be drawn, and all else."""
+    return Pace(_IMAGES_SHARE), Pace(_WORDS_SHARE)
+
+
+def _note_drawing(pace: Pace, began: float) -> None:
+    pace.note(began, time.perf_counter())
+
+
+def wait_for_workers() -> None:
+    """Wait for what other threads are at, because Python is ending: a worker must not outlive the signals it sends."""
+    pool = QThreadPool.globalInstance()
+    if pool is not None:
+        pool.waitForDone()
+
+
+def _end(control: Control) -> None:
+    control.stop()
+    wait_for_workers()

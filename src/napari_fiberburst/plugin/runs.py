@@ -1,6 +1,7 @@
 """What is kept of each run: settings, result, time and layers; two of them side by side; and how they are saved."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,11 +11,11 @@ from qtpy.QtCore import Qt, Signal
 from qtpy.QtWidgets import (
     QComboBox,
     QFileDialog,
-    QLabel,
-    QListWidget,
-    QListWidgetItem,
+    QHeaderView,
     QPushButton,
     QSpinBox,
+    QTableWidget,
+    QTableWidgetItem,
     QVBoxLayout,
     QWidget,
 )
@@ -23,8 +24,9 @@ from napari_fiberburst.errors import BundleError, FiberBurstError
 from napari_fiberburst.io.results import write_homographies
 from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.bursts import BurstSource
+from napari_fiberburst.plugin.evidence import MOTION_KINDS
 from napari_fiberburst.plugin.history import History
-from napari_fiberburst.plugin.job import Scores
+from napari_fiberburst.plugin.job import CurvePoint, Scores
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.sections import row_of
 from napari_fiberburst.settings import SplineMethod
@@ -35,6 +37,15 @@ if TYPE_CHECKING:
 
 _LINES_OF_RUNS = 4
 _MORE_STEPS = 200
+_NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
+# What a row tells of a run, and in more words.
+_COLUMNS = {
+    "run": "Double-click to change it.",
+    "method": "The preset, or the encoding of the scene.",
+    "s": "Seconds that it took.",
+    "verdict": "What the burst says of the image.",
+    "error": "By how much samples that were left out are missed, intensity units.",
+}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -57,6 +68,10 @@ class KeptRun:
         In the viewer.
     history : History
         The images on the way.
+    curve : sequence of CurvePoint
+        How it went; grows at its end while it runs.
+    span : float
+        The camera's full scale, which errors on the curves are parts of.
     turned_live : list of (float, str, object)
         Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
@@ -72,30 +87,46 @@ class KeptRun:
     layers: RunLayers
     bundle: BundleSource | None = None
     history: History = field(default_factory=History)
+    curve: Sequence[CurvePoint] = ()
+    span: float = 1.0
     turned_live: list[tuple[float, str, Any]] = field(default_factory=list)
     result: "Reconstruction | None" = None
     scores: Scores | None = None
 
     @property
-    def summary(self) -> str:
-        """What came of it, in a few lines."""
+    def summary(self) -> tuple[str, ...]:
+        """What came of it in numbers, line by line."""
         result = self.result
         if result is None:
-            return ""
-        used = "" if result.frames_used is None else f", {len(result.frames_used)} of {len(result.homographies)} frames"
-        verdict = "" if result.quality is None else f"{result.quality}; "
-        lines = [f"{verdict}{result.ending} in {result.seconds:.1f} s on {result.device}{used}"]
+            return ()
+        seen = []
         if result.resolution is not None:
             size, unit = result.acquisition.pixel_size, result.acquisition.unit
             length = "" if size is None else f" = {result.resolution * sum(size) / 2:.3g} {unit}"
-            lines.append(f"halves of the burst agree down to {result.resolution:.1f} px{length}")
+            seen.append(f"finest detail {result.resolution:.1f} px{length}")
+        if result.frames_used is not None:
+            seen.append(f"{len(result.frames_used)} of {len(result.homographies)} frames")
+        ended = f"{result.ending} in {result.seconds:.1f} s on {result.device}"
+        filled = "" if result.coverage is None else f"{(result.coverage == 0).mean():.1%} filled in · "
+        lines = [" · ".join(seen), filled + ended]
         if self.scores is not None:
             scores = self.scores
             lines.append(
                 f"against the truth: PSNR {scores.psnr:.1f} dB, SSIM {scores.ssim:.3f}, motion off by "
                 f"{scores.motion_error:.2g} px"
             )
-        return "\n".join([*lines, *(f"Note: {note}" for note in result.notes)])
+        return tuple(filter(None, lines))
+
+    @property
+    def row(self) -> tuple[str | float, ...]:
+        """What is told of it in a table: name, method, seconds, verdict, and error of samples left out."""
+        result = self.result
+        named = str(self.choices.get("encoding", self.choices.get("preset", "")))
+        if result is None:
+            return self.name, named, "", "", ""
+        method = named or str(result.settings.flat()["encoding"])
+        error = "" if result.held_out_rmse is None else float(f"{result.held_out_rmse:.3g}")
+        return self.name, method, round(result.seconds, 1), result.quality or "", error
 
     @property
     def has_bundle(self) -> bool:
@@ -117,7 +148,7 @@ class KeptRun:
 
 
 class RunsPanel(QWidget):
-    """The list of runs, and what can be done with them."""
+    """The table of runs, and what can be done with them."""
 
     chosen = Signal(object)  # KeptRun or None
     continue_asked = Signal(object, int)  # KeptRun, steps
@@ -125,14 +156,9 @@ class RunsPanel(QWidget):
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        self._runs: list[KeptRun] = []
+        self._runs: list[KeptRun] = []  # newest first
         self._is_running = False
-        self.list_of_runs = QListWidget()
-        self.list_of_runs.setMaximumHeight(_LINES_OF_RUNS * self.fontMetrics().height() + 16)
-        self.list_of_runs.setToolTip("The runs so far; double-click one to name it.")
-        self._summary = QLabel()
-        self._summary.setWordWrap(True)
-        self._summary.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.table = QTableWidget(0, len(_COLUMNS))
         self.other = QComboBox()
         self.other.setToolTip("The run to compare with the one selected above.")
         self.compare_button = QPushButton("A / B")
@@ -153,28 +179,41 @@ class RunsPanel(QWidget):
     @property
     def run(self) -> KeptRun | None:
         """The run that is selected."""
-        row = self.list_of_runs.currentRow()
-        return self._runs[row] if 0 <= row < len(self._runs) else None
+        item = self.table.item(self.table.currentRow(), 0)
+        return None if item is None else item.data(Qt.ItemDataRole.UserRole)
 
     @property
     def runs(self) -> tuple[KeptRun, ...]:
         """All runs, oldest first."""
-        return tuple(self._runs)
+        return tuple(reversed(self._runs))
 
     def add(self, run: KeptRun) -> None:
-        """Keep a run and select it."""
+        """Keep a run, in the first row, and select it."""
         # Nobody can tell the outlines of two runs apart, and all that is shown makes each drawing slower.
         for before in self._runs:
-            before.layers.set_visible("frame", False)
-        self._runs.append(run)
-        item = QListWidgetItem(run.name)
-        item.setFlags(item.flags() | Qt.ItemFlag.ItemIsEditable)
-        self.list_of_runs.addItem(item)
-        self.list_of_runs.setCurrentItem(item)
-        self._follow()
+            for kind in MOTION_KINDS:
+                before.layers.switch(kind, False)
+        self._runs.insert(0, run)
+        with self._quiet_table() as table:
+            table.insertRow(0)
+            for column in range(len(_COLUMNS)):
+                item = QTableWidgetItem()
+                item.setData(Qt.ItemDataRole.UserRole, run)
+                if column > 0:
+                    item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable)
+                table.setItem(0, column, item)
+            self._fill(0, run)
+        self.select(run)
+
+    def select(self, run: KeptRun) -> None:
+        """Select a run."""
+        self.table.setCurrentCell(self._row(run), 0)
 
     def refresh(self) -> None:
-        """Show what has become of the run that is selected."""
+        """Show what has become of the runs."""
+        with self._quiet_table():
+            for run in self._runs:
+                self._fill(self._row(run), run)
         self._follow()
 
     def save_result(self, run: KeptRun, path: str | Path) -> None:
@@ -196,11 +235,9 @@ class RunsPanel(QWidget):
     def remove(self, run: KeptRun) -> None:
         """Forget a run and take its layers away."""
         self.compare_button.setChecked(False)
-        row = self._runs.index(run)
-        self.list_of_runs.blockSignals(True)
-        self._runs.remove(run)
-        self.list_of_runs.takeItem(row)
-        self.list_of_runs.blockSignals(False)
+        with self._quiet_table() as table:
+            table.removeRow(self._row(run))
+            self._runs.remove(run)
         run.layers.remove()
         self._follow()
         self.removed.emit(run)
@@ -223,14 +260,38 @@ class RunsPanel(QWidget):
         ]
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
-        layout.addWidget(self.list_of_runs)
-        layout.addWidget(self._summary)
+        self._lay_out_table()
+        layout.addWidget(self.table)
         for widgets in rows:
             layout.addLayout(row_of(*widgets))
 
+    def _lay_out_table(self) -> None:
+        table = self.table
+        table.setHorizontalHeaderLabels(list(_COLUMNS))
+        for column, tip in enumerate(_COLUMNS.values()):
+            heading = table.horizontalHeaderItem(column)
+            assert heading is not None  # its label has been set
+            heading.setToolTip(tip)
+        header, rows = table.horizontalHeader(), table.verticalHeader()
+        assert header is not None  # every table has both
+        assert rows is not None
+        header.setMinimumSectionSize(_NARROWEST_COLUMN)
+        header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+        header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        header.setSortIndicator(-1, Qt.SortOrder.AscendingOrder)
+        rows.setVisible(False)
+        rows.setDefaultSectionSize(self.fontMetrics().height() + _ABOVE_AND_BELOW)
+        table.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
+        table.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
+        table.setSortingEnabled(True)
+        table.setShowGrid(False)
+        table.setFixedHeight((_LINES_OF_RUNS + 1) * (self.fontMetrics().height() + _ABOVE_AND_BELOW) + _ABOVE_AND_BELOW)
+        table.setAccessibleName("runs")
+        table.setToolTip("The runs so far, the newest first; press a heading to sort them by it.")
+
     def _connect(self) -> None:
-        self.list_of_runs.currentRowChanged.connect(self._take_choice)
-        self.list_of_runs.itemChanged.connect(self._rename)
+        self.table.currentCellChanged.connect(self._take_choice)
+        self.table.itemChanged.connect(self._rename)
         self.compare_button.toggled.connect(self._show_a_or_b)
         self.other.activated.connect(lambda _: self._show_a_or_b(self.compare_button.isChecked()))
         self.save_button.clicked.connect(self._ask_and_save)
@@ -244,8 +305,6 @@ class RunsPanel(QWidget):
         run = self.run
         result = None if run is None else run.result
         has_result = result is not None
-        self._summary.setText("" if run is None else run.summary)
-        self._summary.setVisible(has_result)
         for button in (self.save_button, self.save_motion_button):
             button.setEnabled(has_result)
         self.remove_button.setEnabled(has_result or (run is not None and not self._is_running))
@@ -274,19 +333,42 @@ class RunsPanel(QWidget):
             else "A spline is solved to its end, not trained: there is nothing to continue. Networks can go on."
         )
 
-    def _take_choice(self) -> None:
+    def _row(self, run: KeptRun) -> int:
+        """Return where a run stands, which the user can sort."""
+        items = [self.table.item(row, 0) for row in range(self.table.rowCount())]
+        return next(
+            row for row, item in enumerate(items) if item is not None and item.data(Qt.ItemDataRole.UserRole) is run
+        )
+
+    @contextmanager
+    def _quiet_table(self) -> Iterator[QTableWidget]:
+        """Let the table be changed: no signals, and each row stays where it is until the end."""
+        self.table.blockSignals(True)
+        self.table.setSortingEnabled(False)
+        yield self.table
+        self.table.setSortingEnabled(True)
+        self.table.blockSignals(False)
+
+    def _fill(self, row: int, run: KeptRun) -> None:
+        for column, value in enumerate(run.row):
+            item = self.table.item(row, column)
+            if item is not None:
+                # As numbers, which are sorted as such.
+                item.setData(Qt.ItemDataRole.DisplayRole, value)
+
+    def _take_choice(self, row: int, column: int, row_before: int, column_before: int) -> None:
+        if row == row_before:
+            return
         self.compare_button.setChecked(False)
         self._follow()
         self.chosen.emit(self.run)
 
-    def _rename(self, item: QListWidgetItem) -> None:
-        run, name = self._runs[self.list_of_runs.row(item)], item.text().strip()
+    def _rename(self, item: QTableWidgetItem) -> None:
+        run, name = item.data(Qt.ItemDataRole.UserRole), item.text().strip()
         if name and name != run.name:
             run.name = name
             run.layers.rename(name)
-        elif not name:
-            item.setText(run.name)
-        self._follow()
+        self.refresh()
 
     def _show_a_or_b(self, is_b: bool) -> None:
         """Show the image of one run, A or B, and hide those of all others."""

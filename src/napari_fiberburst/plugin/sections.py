@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from qtpy.QtCore import QEvent, Qt
+from qtpy.QtCore import QEvent, QSize, Qt
 from qtpy.QtGui import QIcon, QPixmap
-from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QScrollArea, QVBoxLayout, QWidget
 from superqt import QCollapsible
 
 _ABOVE_CONTENT, _BELOW_CONTENT = 4, 10
@@ -16,6 +16,36 @@ class _Section(QCollapsible):
     def eventFilter(self, watched: Any, event: Any) -> bool:
         if event.type() == QEvent.Type.LayoutRequest and self.isExpanded():
             self.content().setMaximumHeight(self.content().sizeHint().height() + _BELOW_CONTENT)
+        return bool(super().eventFilter(watched, event))
+
+
+class Column(QScrollArea):
+    """Scrolls downwards alone, and is never narrower than what is in it: nothing is cut off.
+
+    Parameters
+    ----------
+    content : QWidget
+        What is in it.
+    """
+
+    def __init__(self, content: QWidget) -> None:
+        super().__init__()
+        self.setWidgetResizable(True)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setFrameShape(QScrollArea.Shape.NoFrame)
+        self.setWidget(content)
+
+    def minimumSizeHint(self) -> QSize:
+        """Ask for the content's least width, and room for the scroll bar."""
+        content, bar = self.widget(), self.verticalScrollBar()
+        if content is None or bar is None:
+            return super().minimumSizeHint()
+        return QSize(content.minimumSizeHint().width() + bar.sizeHint().width(), super().minimumSizeHint().height())
+
+    def eventFilter(self, watched: Any, event: Any) -> bool:
+        """Ask anew when what is in it has changed."""
+        if event.type() == QEvent.Type.LayoutRequest:
+            self.updateGeometry()
         return bool(super().eventFilter(watched, event))
 
 

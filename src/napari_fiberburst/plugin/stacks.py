@@ -67,33 +67,6 @@ def residual_maps(residuals: NDArray[np.float32], labels: NDArray[np.int32]) -> 
     return da.stack(maps)
 
 
-def moved_points(
-    points: NDArray[np.float64], homography: NDArray[np.float64], flow: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
-    """Return where a frame's points (N, 2) lie in the reference frame's pixels."""
-    return transform_points(homography, points) if flow is None else points + _at(flow, points)
-
-
-def bending(flow: NDArray[np.float64], homography: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
-    """Return by how much a frame bends beyond its homography, as arrows (N, 2, 2): from where, by how much; (x, y).
-
-    Parameters
-    ----------
-    flow : numpy.ndarray
-        (H, W, 2), frame pixel to reference pixel.
-    homography : numpy.ndarray
-        The same without bending.
-    steps : int
-        Arrows along the longer side.
-    """
-    height, width = flow.shape[:2]
-    step = max(height, width) / steps
-    y, x = np.mgrid[step / 2 : height : step, step / 2 : width : step]
-    points = np.stack([x.ravel(), y.ravel()], axis=1)
-    places = moved_points(points, homography, flow)
-    return np.stack([places, places - transform_points(homography, points)], axis=1)
-
-
 def _at(flow: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     at = points[..., ::-1].reshape(-1, 2).T
     parts = [map_coordinates(flow[..., axis], at, order=1, mode="nearest") for axis in (0, 1)]
