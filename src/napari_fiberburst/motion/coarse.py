@@ -1,8 +1,8 @@
 """Registration without honeycomb: from core samples to the transform of every frame, and how far to trust it.
 
 Coarse, by cross-correlation normalised by the overlap (Padfield, 2012): whitened phase correlation locks on the bundle
-or on noise. All pairs vote, and the best-connected tree of pairs gives the shifts, so motion may exceed the field as
-long as some frames overlap. Fine, by `napari_fiberburst.motion.joint`.
+or on noise. The best-connected tree of pairs gives the shifts, so motion may exceed the field as long as some frames
+overlap. Fine, by `napari_fiberburst.motion.joint`.
 """
 
 from collections.abc import Iterator

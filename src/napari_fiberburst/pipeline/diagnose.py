@@ -97,11 +97,12 @@ def diagnose(
     expected = scene.grid.at(_places(canvas, std))(std)
     fit = collect(scene, registration, _variance(noise, bundle, acquisition, registration, samples))
     verdict = judge(fit, registration, bundle.pitch, gains_known=bundle.gains_known)
+    told = () if fit.is_smeared_far(bundle.pitch) else _told(scene.smear)
     return replace(
         found,
         quality=verdict.quality,
         misfit=fit.misfit if math.isfinite(fit.misfit) else None,
-        notes=(*notes, *_told(scene.smear), *verdict.reasons),
+        notes=(*notes, *told, *verdict.reasons),
         uncertainty=(expected * span).cpu().numpy().astype(np.float32),
         residuals=(residuals * span).cpu().numpy().astype(np.float32),
         held_out_rmse=None if scene.held_out_rmse is None else scene.held_out_rmse * span,

@@ -103,6 +103,10 @@ class GoodnessOfFit:
     smear: float
     is_noise_known: bool
 
+    def is_smeared_far(self, pitch: float) -> bool:
+        """Whether frames moved so far while they were exposed that detail is lost."""
+        return self.smear > _LONG_SMEAR * pitch
+
     @property
     def unevenness(self) -> float:
         """Upper over lower quartile of the frames' misfit."""
@@ -249,7 +253,7 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
         reasons.append(
             "what the image leaves unexplained is alike in neighbouring cores, so something else than noise is in it"
         )
-    if fit.smear > _LONG_SMEAR * pitch:
+    if fit.is_smeared_far(pitch):
         reasons.append(
             f"frames moved by {fit.smear:.1f} px while they were exposed: detail along the motion is lost; a shorter "
             "exposure shows it"
