@@ -1,10 +1,12 @@
 """A viewer with the dock in it, and a burst to run; nothing is written to the user's own settings."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from napari.layers import Image
 from napari.utils import progress
 from qtpy.compat import isalive
@@ -73,3 +75,18 @@ def run_through(qtbot) -> Callable[[FiberBurstWidget], Any]:
 def grey_frames(simulated) -> np.ndarray:
     """Return the burst's green channel as it was recorded, (8, 63, 75) uint8."""
     return simulated.arrays()["frames"][..., 1]
+
+
+@pytest.fixture
+def ome_file(tmp_path, simulated) -> Path:
+    """Return a file of two channels, half a micrometre by a quarter a pixel, a frame each 0.2 s."""
+    path = tmp_path / "recorded.ome.tif"
+    told = {
+        "axes": "TCYX",
+        "PhysicalSizeY": 0.5,
+        "PhysicalSizeX": 0.25,
+        "TimeIncrement": 0.2,
+        "Channel": {"Name": ["red", "green"]},
+    }
+    tifffile.imwrite(path, simulated.arrays()["frames"][..., :2].transpose(0, 3, 1, 2), metadata=told)
+    return path

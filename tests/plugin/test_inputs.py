@@ -3,7 +3,6 @@
 import dask.array as da
 import numpy as np
 import pytest
-import tifffile
 from napari.layers import Image, Labels, Shapes
 from napari.utils.notifications import notification_manager
 from npe2 import PluginManifest
@@ -82,21 +81,6 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     assert [str(unit) for unit in image.units] == ["micrometer", "micrometer"]
     for own in ("outlines", "path"):
         np.testing.assert_allclose(viewer.layers[f"run 1: {own}"].scale, [1, 0.5, 0.25])
-
-
-@pytest.fixture
-def ome_file(tmp_path, simulated):
-    """Return a file of two channels, half a micrometre by a quarter a pixel, a frame each 0.2 s."""
-    path = tmp_path / "recorded.ome.tif"
-    told = {
-        "axes": "TCYX",
-        "PhysicalSizeY": 0.5,
-        "PhysicalSizeX": 0.25,
-        "TimeIncrement": 0.2,
-        "Channel": {"Name": ["red", "green"]},
-    }
-    tifffile.imwrite(path, simulated.arrays()["frames"][..., :2].transpose(0, 3, 1, 2), metadata=told)
-    return path
 
 
 def test_what_an_ome_tiff_says_is_in_results_although_napari_opens_it(

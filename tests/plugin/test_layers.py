@@ -7,6 +7,7 @@ from napari.layers import Image
 
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.io.picture import limits_of
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.placement import Placement
 
@@ -43,3 +44,25 @@ def test_contrast_that_a_user_has_set_stays(rng):
     shown.contrast_limits = (0.25, 0.5)
     layers.show_image(3 * rng.random((31, 37), dtype=np.float32), acquisition, CANVAS)
     assert tuple(shown.contrast_limits) == (0.25, 0.5)
+
+
+@pytest.mark.parametrize("nothing", [np.nan, 0.0, 0.5])
+def test_an_image_without_contrast_is_shown_and_the_next_one_seen(rng, nothing):
+    """Limits that are alike are refused by napari."""
+    layers, acquisition = layers_over(Image(rng.random((5, 31, 37), dtype=np.float32)), "TYX")
+    even = np.full((31, 37), nothing, np.float32)
+    resolved = 0.1 * rng.random((31, 37), dtype=np.float32)
+    for image in (even, resolved, even, resolved):
+        layers.show_image(image, acquisition, CANVAS)
+        (shown,) = layers.images
+        assert shown.contrast_limits[0] < shown.contrast_limits[1]
+        np.testing.assert_array_equal(shown.data, image)
+    assert tuple(shown.contrast_limits) == pytest.approx((0, 0.1), abs=0.002)
+
+
+def test_a_layer_shows_what_a_picture_of_the_same_image_shows(rng):
+    layers, acquisition = layers_over(Image(rng.random((5, 31, 37), dtype=np.float32)), "TYX")
+    image = rng.random((31, 37), dtype=np.float32)
+    image[3, 4], image[5, 6] = 1e6, np.nan
+    layers.show_image(image, acquisition, CANVAS)
+    assert tuple(layers.images[0].contrast_limits) == limits_of(image)

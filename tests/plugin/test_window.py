@@ -61,6 +61,7 @@ def test_the_dock_is_as_wide_as_what_is_in_it_in_a_small_window(make_napari_view
     viewer.window.resize(800, 600)
     dock = FiberBurstWidget(viewer)
     viewer.window.add_dock_widget(dock, name="fiber burst")
+    viewer.add_image(np.zeros((5, 31, 37), np.uint8))
     viewer.window.resize(800, 600)
     content, seen = dock.findChild(QScrollArea).widget(), dock.findChild(QScrollArea).viewport()
     qtbot.wait(300)

@@ -263,11 +263,9 @@ def _truth(metadata: dict[str, Any], data: Any, axes: str) -> Truth | None:
 def _path(layer: Image, metadata: dict[str, Any]) -> str | None:
     """Return the file that reads as this layer; not one that holds other frames or channels too, or did once."""
     path, shape = layer.source.path, data_of(layer).shape
-    if path is None:
-        return None
     if "shape" in metadata:  # by the reader of this plugin
-        return str(path) if tuple(metadata["shape"]) == shape else None
-    if not str(path).lower().endswith(TIFF_ENDINGS):
+        return str(metadata["burst_path"]) if tuple(metadata["shape"]) == shape else None
+    if path is None or not str(path).lower().endswith(TIFF_ENDINGS):
         return None
     try:
         with tifffile.TiffFile(path) as file:

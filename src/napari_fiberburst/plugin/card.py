@@ -8,6 +8,7 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QGridLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.plugin.evidence import KINDS
+from napari_fiberburst.plugin.reporting import ReportBox
 from napari_fiberburst.plugin.runs import KeptRun
 
 _COLUMNS = 2
@@ -34,6 +35,8 @@ class ResultCard(QWidget):
         What came of the run, and what to know before trusting it.
     switches : dict of str to QCheckBox
         By what they show.
+    report : ReportBox
+        Writes all of it on a page.
     """
 
     def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
@@ -45,11 +48,13 @@ class ResultCard(QWidget):
             label.setWordWrap(True)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.switches = {kind: QCheckBox(kind) for kind in KINDS}
+        self.report = ReportBox()
         layout, self._grid = QVBoxLayout(self), QGridLayout()
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.words)
         layout.addLayout(self._grid)
         layout.addWidget(self.notes)
+        layout.addWidget(self.report)
         for kind, switch in self.switches.items():
             switch.setToolTip(KINDS[kind])
             switch.toggled.connect(lambda on, kind=kind: self._switch(kind, on))
@@ -85,6 +90,7 @@ class ResultCard(QWidget):
         self.notes.setText("<br>".join(f"Note: {escape(note)}" for note in notes))
         for label in (self.words, self.notes):
             label.setVisible(bool(label.text()))
+        self.report.show_run(run)
         self.setVisible(bool(offered))
 
     def _offer(self, kinds: list[str]) -> None:

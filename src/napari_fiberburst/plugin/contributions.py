@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from napari_fiberburst.data.burst import Burst
 
 LayerData = tuple[Any, dict[str, Any], str]
-_PLUGIN, _WIDGET = "napari-fiberburst", "Fiber burst reconstruction"
+PLUGIN = "napari-fiberburst"
+_WIDGET = "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
 # What a file of a simulated burst holds of the recording; all else is truth.
@@ -134,7 +135,7 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
     if frames.ndim == 4 and not look["rgb"]:
         frames = frames.transpose(0, 3, 1, 2)  # napari draws the last two axes
     recording = {"channel_names": burst.channel_names, "times": () if burst.times is None else burst.times.tolist()}
-    look["metadata"][METADATA_KEY] |= {"shape": frames.shape, RECORDING_KEY: recording}
+    look["metadata"][METADATA_KEY] |= {"burst_path": str(path), "shape": frames.shape, RECORDING_KEY: recording}
     return [(frames, look, "image")]
 
 
@@ -183,7 +184,7 @@ def _start(show: str) -> None:
     layer = viewer.layers.selection.active
     # From the menu, napari opens the dock under another name than from here.
     open_already = [widget for widget in viewer.window.dock_widgets.values() if isinstance(widget, FiberBurstWidget)]
-    widget = open_already[0] if open_already else viewer.window.add_plugin_dock_widget(_PLUGIN, _WIDGET)[1]
+    widget = open_already[0] if open_already else viewer.window.add_plugin_dock_widget(PLUGIN, _WIDGET)[1]
     if layer is None:
         show_error("no layer is selected; select the burst's layer")
     else:

@@ -26,6 +26,7 @@ from napari_fiberburst.plugin.calls import as_python
 from napari_fiberburst.plugin.copying import CopyButtons
 from napari_fiberburst.plugin.departures import Departures
 from napari_fiberburst.plugin.display import AnimationThrottle, Display
+from napari_fiberburst.plugin.empty import EmptyBox
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
@@ -66,6 +67,7 @@ class FiberBurstWidget(QWidget):
         self._missing: dict[str, str] | None = None
         self._throttle = AnimationThrottle()
         self._is_network = False
+        self.empty, self._filled = EmptyBox(viewer), QWidget()
         self.input = InputBox(viewer)
         self.form = SettingsForm()
         self.runner = Runner(self)
@@ -83,7 +85,7 @@ class FiberBurstWidget(QWidget):
         self._lay_out()
         self._connect()
         self._follow_state("ready")
-        self._estimate()
+        self._take_input()
         self.departures.begin_anew()
         self._warm_up()
 
@@ -208,6 +210,13 @@ class FiberBurstWidget(QWidget):
     def _forget(self, run: KeptRun) -> None:
         if run is self._run:
             self._run = None
+        self._show_or_invite()
+
+    def _show_or_invite(self) -> None:
+        """Show what can be done with a burst, or offer to open one where there is none, and nothing is kept of one."""
+        is_empty = self.input.burst.value is None and not self.runs.runs
+        self.empty.setVisible(is_empty)
+        self._filled.setVisible(not is_empty)
 
     def _follow_state(self, state: str) -> None:
         """Offer what can be done now."""
@@ -258,6 +267,7 @@ class FiberBurstWidget(QWidget):
         if self.input.burst.value is not self._burst:
             self._burst = self.input.burst.value
             self.departures.begin_anew()
+        self._show_or_invite()
         self._estimate()
 
     def _set_back(self) -> None:
@@ -297,7 +307,12 @@ class FiberBurstWidget(QWidget):
         self.stop_button.setToolTip("End the run; what it has come to is kept.")
         self.pause_button.setToolTip("Hold the run where it is.")
         content = QWidget()
-        column = QVBoxLayout(content)
+        whole = QVBoxLayout(content)
+        whole.addWidget(self.empty)
+        whole.addWidget(self._filled)
+        whole.addStretch(1)
+        column = QVBoxLayout(self._filled)
+        column.setContentsMargins(0, 0, 0, 0)
         column.addWidget(self.input)
         column.addWidget(self.departures)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
@@ -307,12 +322,11 @@ class FiberBurstWidget(QWidget):
         column.addWidget(self.display.curve_box)
         column.addWidget(self.runs)
         column.addWidget(self.display.past_box)
-        column.addStretch(1)
         scroll = Column(content)
         WheelFilter(scroll)
-        whole = QVBoxLayout(self)
-        whole.setContentsMargins(0, 0, 0, 0)
-        whole.addWidget(scroll)
+        around = QVBoxLayout(self)
+        around.setContentsMargins(0, 0, 0, 0)
+        around.addWidget(scroll)
 
     def _settings(self) -> QWidget:
         """Return what most runs need nothing of."""

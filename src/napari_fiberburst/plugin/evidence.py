@@ -9,7 +9,8 @@ from napari.layers import Image, Layer, Shapes, Tracks, Vectors
 from numpy.typing import NDArray
 
 from napari_fiberburst.coordinates import transform_points
-from napari_fiberburst.plugin.placement import Placement, limits_of
+from napari_fiberburst.io.picture import limits_of
+from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.stacks import residual_maps, stabilised
 
 if TYPE_CHECKING:
@@ -174,8 +175,8 @@ def result_layers(kind: str, result: "Reconstruction", frames: Any, placement: P
 def _image(array: Any, axes: str, placement: Placement, canvas: "Canvas | None" = None, **look: Any) -> Image:
     if "contrast_limits" not in look:
         # napari's own guess takes what is infinite, and one odd pixel, for the whole range.
-        limits = limits_of(array)
-        look |= {} if limits is None else {"contrast_limits": limits}
+        low, high = limits_of(array)
+        look |= {"contrast_limits": (low, high)} if high > low else {}
     data, axes = (array, axes) if look.get("rgb") else placement.arrange(array, axes)
     return Image(data, **placement.on_canvas(axes, canvas), **look)
 

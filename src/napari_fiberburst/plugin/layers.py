@@ -10,6 +10,7 @@ from napari.layers import Image, Layer
 from numpy.typing import NDArray
 
 from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.io.picture import limits_of
 from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.evidence import (
     MOTION_KINDS,
@@ -21,7 +22,7 @@ from napari_fiberburst.plugin.evidence import (
     path,
     result_layers,
 )
-from napari_fiberburst.plugin.placement import COLOUR_LIMITS, Placement, as_colour, limits_of
+from napari_fiberburst.plugin.placement import COLOUR_LIMITS, Placement, as_colour
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
@@ -180,9 +181,9 @@ class RunLayers:
     def _add_image(self, kind: str, data: NDArray[np.float32], placed: dict[str, Any], colormap: Any) -> None:
         # Left to itself, napari takes the limits of the first image, which of a network is nearly even.
         more: dict[str, Any] = {"contrast_limits": COLOUR_LIMITS} if self.placement.rgb else {"colormap": colormap}
-        limits = limits_of(data)
-        if limits is not None and not self.placement.rgb:
-            more["contrast_limits"] = limits
+        low, high = limits_of(data)
+        if high > low and not self.placement.rgb:
+            more["contrast_limits"] = (low, high)
         if self.placement.channels:
             more["blending"] = "additive"
         self._insert(kind, Image(data, rgb=self.placement.rgb, **placed, **more))
@@ -191,11 +192,11 @@ class RunLayers:
 
     def _fit_contrast(self, kind: str, layer: Image, data: NDArray[np.float32]) -> None:
         """Follow the image with the contrast, until the user takes it in hand."""
-        limits = limits_of(data)
-        if kind not in self._limits or limits is None or tuple(layer.contrast_limits) != self._limits[kind]:
+        low, high = limits_of(data)
+        if kind not in self._limits or high <= low or tuple(layer.contrast_limits) != self._limits[kind]:
             return
-        layer.contrast_limits_range = limits
-        layer.contrast_limits = limits
+        layer.contrast_limits_range = (low, high)
+        layer.contrast_limits = (low, high)
         self._limits[kind] = tuple(layer.contrast_limits)
 
     def _put_motion(self) -> None:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
 
-# Parts of an image's values that are let go below and above when its contrast is set.
-_DARKEST, _BRIGHTEST = 0.1, 99.9
 # Of what `as_colour` returns.
 COLOUR_LIMITS = (0.0, 1.0)
 
@@ -153,15 +151,6 @@ def as_colour(image: NDArray[np.float32], acquisition: Acquisition) -> NDArray[n
     known = np.isfinite(image).all(axis=-1, keepdims=True)
     scaled = np.clip((image - acquisition.black_level) / span, 0, 1)
     return np.concatenate([np.where(known, scaled, 0), known], axis=-1, dtype=np.float32)
-
-
-def limits_of(image: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Return contrast limits that show an image well; None where nothing in it differs."""
-    known = image[np.isfinite(image)]
-    if known.size == 0:
-        return None
-    low, high = np.percentile(known, [_DARKEST, _BRIGHTEST])
-    return (float(low), float(high)) if high > low else None
 
 
 def _world_from_data(layer: Image) -> NDArray[np.float64] | None:

@@ -253,10 +253,9 @@ class RunsPanel(QWidget):
         self._more_steps.setValue(_MORE_STEPS)
         self._more_steps.setSuffix(" more steps")
         rows = [
-            (self.compare_button, self.other),
+            (self.compare_button, self.other, self.remove_button),
             (self.continue_button, self._more_steps),
-            (self.save_button, self.save_motion_button),
-            (self.keep_button, self.remove_button),
+            (self.save_button, self.save_motion_button, self.keep_button),
         ]
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)

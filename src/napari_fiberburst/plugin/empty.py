@@ -1,0 +1,107 @@
+"""What the dock shows while there is no burst: ways to open one."""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from napari.components import ViewerModel
+from napari.layers import Layer
+from npe2 import PluginManager
+from qtpy.QtCore import Qt
+from qtpy.QtWidgets import QFileDialog, QLabel, QMenu, QPushButton, QVBoxLayout, QWidget
+from superqt.utils import create_worker
+
+from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.io.read import ARCHIVE_ENDINGS
+from napari_fiberburst.io.tiff import TIFF_ENDINGS
+from napari_fiberburst.plugin.contributions import PLUGIN, LayerData, read
+from napari_fiberburst.plugin.sections import row_of
+
+logger = logging.getLogger(__name__)
+
+_FILES = " ".join(f"*{ending}" for ending in (*TIFF_ENDINGS, *ARCHIVE_ENDINGS))
+_INVITATION = "Open the frames of a burst: 10 to 20 that moved a little. Or drop them on the window."
+
+
+class EmptyBox(QWidget):
+    """Opens a burst, by the reader of the command line, or a sample; in another thread.
+
+    Parameters
+    ----------
+    viewer : ViewerModel
+        Where to.
+
+    Attributes
+    ----------
+    open_button, folder_button, sample_button : QPushButton
+        Locked while something is opened.
+    words : QLabel
+        What to do, or why something could not be opened.
+    """
+
+    def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self._viewer = viewer
+        self.words = QLabel(_INVITATION)
+        self.words.setWordWrap(True)
+        self.words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
+        self.open_button, self.folder_button = QPushButton("Open…"), QPushButton("Open folder…")
+        self.sample_button = QPushButton("Try a sample")
+        self.open_button.setToolTip("Open a TIFF stack, or a burst of fiberburst simulate.")
+        self.folder_button.setToolTip("Open a folder of PNG or TIFF frames, or an OME-Zarr image.")
+        self.sample_button.setToolTip("Simulate a burst whose truth is known.")
+        self.samples = QMenu(self.sample_button)
+        self.samples.aboutToShow.connect(self._list_samples)
+        self.sample_button.setMenu(self.samples)
+        column = QVBoxLayout(self)
+        column.setContentsMargins(0, 0, 0, 0)
+        column.addWidget(self.words)
+        column.addLayout(row_of(self.open_button, self.folder_button))
+        column.addWidget(self.sample_button)
+        self.open_button.clicked.connect(self._ask_for_file)
+        self.folder_button.clicked.connect(self._ask_for_folder)
+
+    def open(self, path: str) -> None:
+        """Open a burst as a layer, with what its file says of it; or say why not."""
+        self._load(partial(read, path), f"Opening {path}")
+
+    def _ask_for_file(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, "Open a burst", "", f"Bursts ({_FILES})")
+        if path:
+            self.open(path)
+
+    def _ask_for_folder(self) -> None:
+        path = QFileDialog.getExistingDirectory(self, "Open a folder of frames, or an OME-Zarr image")
+        if path:
+            self.open(path)
+
+    def _list_samples(self) -> None:
+        """Offer what napari's own menu of samples has of this plugin."""
+        self.samples.clear()
+        for plugin, samples in PluginManager.instance().iter_sample_data():
+            for sample in samples if plugin == PLUGIN else ():
+                action = self.samples.addAction(sample.display_name)
+                if action is not None:
+                    action.triggered.connect(partial(self._load, sample.open, f"Simulating: {sample.display_name}"))
+
+    def _load(self, make: Callable[[], Any], told: str, *_: Any) -> None:
+        self._set_busy(is_busy=True, words=told)
+        create_worker(make, _connect={"returned": self._take, "errored": self._take_error}, _ignore_errors=True)
+
+    def _take(self, opened: list[LayerData]) -> None:
+        self._set_busy(is_busy=False, words=_INVITATION)
+        for data, look, kind in opened:
+            self._viewer.add_layer(Layer.create(data, look, kind))
+
+    def _take_error(self, error: Exception) -> None:
+        why = str(error)
+        if not isinstance(error, FiberBurstError):
+            logger.error("a burst could not be opened", exc_info=error)
+            why = f"{type(error).__name__}: {error}"
+        self._set_busy(is_busy=False, words=why)
+
+    def _set_busy(self, *, is_busy: bool, words: str) -> None:
+        for button in (self.open_button, self.folder_button, self.sample_button):
+            button.setEnabled(not is_busy)
+        self.words.setText(words)
