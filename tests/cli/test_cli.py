@@ -112,7 +112,7 @@ def test_reconstruct_writes_a_picture_for_a_quick_look(burst_file, tmp_path):
     with Image.open(out) as picture:
         assert (picture.mode, picture.size) == ("RGB", (41, 33))
         assert np.asarray(picture).max() == 255
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["burst.npz", "look.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["look.png", "tissue.burst"]
 
 
 def test_no_loss_is_shown_before_there_is_one(burst_file, tmp_path, capsys, monkeypatch):

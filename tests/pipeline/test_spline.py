@@ -99,7 +99,7 @@ def test_the_same_call_twice_gives_the_same_bits(cores, fitted):
 )
 def test_the_same_bits_with_any_number_of_threads(faults, same):
     # Large enough for torch to share sums, products and transforms out among threads.
-    burst = simulate("histology", shape=(211, 243), frames=12, physics="core", pitch=4.6, faults=faults, seed=4).burst
+    burst = simulate("histology", shape=(211, 243), frames=8, physics="core", pitch=4.6, faults=faults, seed=4).burst
     before, results = torch.get_num_threads(), []
     try:
         for threads in (1, 2):

@@ -59,7 +59,7 @@ def test_the_steps_come_to_what_reconstruct_comes_to(cores, stages):
     fitted = reconstruct(cores.burst, fill=True)
     image = render(cores.burst, bundle, registration, scene, fill=True)
     assert image.shape == fitted.image.shape
-    assert psnr(image, cores.truth[0]) == pytest.approx(psnr(fitted.image, cores.truth[0]), abs=0.05)
+    assert psnr(image, cores.truth[0]) == pytest.approx(psnr(fitted.image, cores.truth[0]), abs=0.1)
     assert motion_error(registration.reference_from_frame, fitted.homographies, SHAPE) < 0.02
     found = diagnose(cores.burst, bundle, registration, scene)
     # A sample at a pixel's edge may fall to either side.

@@ -135,14 +135,14 @@ def test_a_result_keeps_how_its_halves_agree(result, tmp_path):
 
 
 def test_the_command_line_writes_a_report_with_its_own_call(tmp_path, capsys):
-    source = str(tmp_path / "burst.npz")
+    source = str(tmp_path / "tissue.burst")
     assert main(["simulate", "-o", source, "--shape", "63x71", "--frames", "5", "--pitch", "4"]) == 0
     command = ["reconstruct", source, "--report", str(tmp_path / "report.html"), "--seed", "3"]
     assert main(command) == 0
     assert "report.html" in capsys.readouterr().out
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["burst.npz", "report.html"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "tissue.burst"]
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "<h1>burst.npz</h1>" in page
+    assert "<h1>tissue.burst</h1>" in page
     assert f"<pre>{escape(shlex.join(['fiberburst', *command]))}</pre>" in page
 
 

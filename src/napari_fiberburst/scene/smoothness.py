@@ -101,7 +101,8 @@ def _expected_error(
     c B^2 / (c B^2 + lambda P) of a wave, and the noise sigma^2 c B^2 / (c B^2 + lambda P)^2 of samples (Wahba, "Spline
     models for observational data", 1990, chapter 4). That is undone for the halves, and done for all samples, at twice
     the density. A scene's spectrum falls off, which says what it is where the footprint lets nothing through; the noise
-    of samples is white.
+    of samples is white, so its variance is the median over the waves that pass, because what is wrong with gains and
+    motion shows in the longest ones.
 
     Parameters
     ----------
@@ -123,11 +124,18 @@ def _expected_error(
     falling = isotonic_regression(common / transfer**2, weights=trust / trust.max(), increasing=False)
     power = np.maximum(falling.x, 0)
     of_samples = noise * stiff**2 / (density * np.maximum(passed, _LEAST_TRANSFER))
-    variance = np.sum(count * passed * of_samples) / np.sum(count * passed)
+    variance = _weighted_median(of_samples, count * passed)
     weight = _CANDIDATES[:, None] * prior
     all_stiff = 2 * density * passed + weight
     errors = (weight / all_stiff) ** 2 * power + 2 * density * passed * variance / all_stiff**2
     return np.asarray(errors @ count)
+
+
+def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Return the value with half of the weight below it."""
+    order = np.argsort(values)
+    below = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(below, below[-1] / 2)])
 
 
 def choose_among_neighbours(
@@ -149,7 +157,7 @@ def choose_among_neighbours(
     for left in range(_FOLDS):
         normal = assemble(window, in_grey, points, taking_part & (fold != left))
         asked = taking_part & (fold == left)
-        guess = None
+        guess = normal.mean()  # from the smooth side, because the smoothest scenes take many iterations to settle
         for index, smoothness in enumerate(_STILL_CANDIDATES):
             guess = normal.solve(smoothness, guess, _STILL_ITERATIONS)
             risks[index] += misfit(in_grey, points, window, normal.through(guess), asked)[0]

@@ -26,7 +26,7 @@ from napari_fiberburst.stored import Stored
 # Iterations of conjugate gradients, at most, for a scene on the way. Gains and outliers are told by that scene, so it
 # has to have settled where few frames look, too.
 _DRAFT_ITERATIONS = 32
-# From a scene that misses only some of the samples, or has some that it should not.
+# From a scene that has some samples which it should not.
 _MORE_ITERATIONS = 24
 PREVIEW_ITERATIONS = 8
 # Outliers are looked for so many times: in the first scene, they are in the scene too.
@@ -207,7 +207,7 @@ def solving(
     if not left_out.any():
         return scene
     equations = equations + assemble(grid, samples, points, left_out.to(points))
-    coefficients = equations.solve(chosen.weight, coefficients, _MORE_ITERATIONS)
+    coefficients = equations.solve(chosen.weight, coefficients)
     return replace(scene, coefficients=coefficients, equations=equations.without_paths())
 
 

@@ -207,6 +207,12 @@ class NormalEquations:
         shown: Tensor = steady.irfft2(torch.fft.rfft2(padded) * ideal, (height, width))
         return shown[..., _RIM:-_RIM, _RIM:-_RIM]
 
+    def mean(self) -> Tensor:
+        """Return an even scene of the right brightness, (C, H, W): what the smoothest one comes to."""
+        mass = steady.total(self.density())
+        level = torch.stack([steady.total(channel) for channel in self.rhs]) / mass.clamp_min(1e-12)
+        return level[:, None, None].expand(-1, *self.grid.shape).clone()
+
     def _start(self) -> Tensor:
         """Return a scene to start from, (C, H, W): the local mean of the samples, wider where there are few."""
         return filled_mean(self.rhs, self.density(), max((self.radius or 0.0) / self.grid.spacing, 1.0))
