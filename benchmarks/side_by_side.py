@@ -4,10 +4,10 @@
     python -m benchmarks.side_by_side ../before --cases 1:cat "3:by hand" 5
 
 Both fit the same bursts, in turn and each in a fresh process, because machines are shared and noisy; the time is the
-least of the repeats, imports left out. Where others compute on the same machine, OMP_NUM_THREADS=1 makes it steadier. A
-burst has a PSNR against its truth, in dB. The real burst has no truth: its quality is the modulation of the chart's
-finest bars (group 7), 20 log10 M, so that a difference is in dB too. The exit status is 1 where a burst loses more than
---most-loss, or the median ratio of times is above --most-time.
+least of the repeats, in seconds of the processor, imports left out. Where others compute on the same machine,
+OMP_NUM_THREADS=1 makes it steadier. A burst has a PSNR against its truth, in dB. The real burst has no truth: its
+quality is the modulation of the chart's finest bars (group 7), 20 log10 M, so that a difference is in dB too. The exit
+status is 1 where a burst loses more than --most-loss, or the median ratio of times is above --most-time.
 """
 
 import argparse

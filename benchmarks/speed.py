@@ -4,9 +4,9 @@
     python -m benchmarks.speed --burst FOLDER --long --traffic --publish docs
 
 Both versions fit the same bursts in turn, each in a fresh process, because machines are shared and noisy; the time is
-the least of the repeats, imports left out. The earlier version is taken from the repository's history into a folder of
-its own, which is deleted at the end. The exit status is 1 where a ratio of times is 15 % above the one that was
-published: that is how a change that makes the package slower is seen.
+the least of the repeats, in seconds of the processor, imports left out. The earlier version is taken from the
+repository's history into a folder of its own, which is deleted at the end. The exit status is 1 where a ratio of times
+is 15 % above the one that was published: that is how a change that makes the package slower is seen.
 
 --traffic adds how long the machine's memory takes to move what the tensor operations read and write: a fit that took no
 longer would be bound by nothing else.

@@ -7,39 +7,18 @@ import pytest
 
 from napari_fiberburst import Bundle, Registration, reconstruct
 from napari_fiberburst.bundle.samples import sample
-from napari_fiberburst.quality import psnr
 from napari_fiberburst.scene.offsets import find_offsets
-from napari_fiberburst.simulation import Camera, Faults, simulate
 
 SHAPE = (137, 151)
 
 
-def recorded(offset):
-    return simulate(
-        "histology",
-        shape=SHAPE,
-        frames=12,
-        channels=1,
-        physics="core",
-        pitch=4.7,
-        seed=1,
-        camera=Camera(photons=8000, bits=10, exposure=0.8),
-        faults=Faults(offset=offset),
-    )
-
-
-def quality(result, simulated):
-    seen = np.isfinite(result.image)
-    return psnr(result.image[seen][None], simulated.truth[0, ..., 0][seen][None])
-
-
 @pytest.fixture(scope="module")
-def glowing():
-    simulated = recorded(0.4)
+def glowing(recorded):
+    simulated = recorded(frames=12, seed=1, offset=0.4)
     return simulated, reconstruct(simulated.burst)
 
 
-def test_offsets_are_found_and_taken_out(glowing, monkeypatch):
+def test_offsets_are_found_and_taken_out(glowing, quality, monkeypatch):
     simulated, result = glowing
     x, y = result.bundle.centres.round().astype(int).T
     inside = (x > 12) & (x < SHAPE[1] - 12) & (y > 12) & (y < SHAPE[0] - 12)
@@ -53,10 +32,10 @@ def test_offsets_are_found_and_taken_out(glowing, monkeypatch):
 
 
 def test_a_kept_bundle_takes_its_offsets_to_another_burst(glowing, tmp_path):
-    _, result = glowing
+    simulated, result = glowing
     kept = Bundle.load(result.bundle.save(tmp_path / "probe.bundle"))
     np.testing.assert_array_equal(kept.offsets, result.bundle.offsets)
-    burst = recorded(0.4).burst
+    burst = simulated.burst
     without = replace(kept, offsets=0 * kept.offsets)
     taken = sample(burst, without, device="cpu").values - sample(burst, kept, device="cpu").values
     span = burst.white_level - burst.black_level
@@ -64,9 +43,8 @@ def test_a_kept_bundle_takes_its_offsets_to_another_burst(glowing, tmp_path):
     np.testing.assert_allclose(taken[0, seen, 0], (kept.offsets / kept.gains)[seen, 0] / span, atol=1e-5)
 
 
-def test_a_bundle_without_offsets_gets_none():
-    simulated = recorded(0.0)
-    assert not reconstruct(simulated.burst).bundle.offsets.any()
+def test_a_bundle_without_offsets_gets_none(recorded):
+    assert not reconstruct(recorded(frames=12, seed=1).burst).bundle.offsets.any()
 
 
 @pytest.mark.parametrize(("frames", "still"), [(12, True), (5, False)])

@@ -1,33 +1,14 @@
 """Frames that moved while they were exposed are seen to, and the scene is solved along the way that they went."""
 
-import numpy as np
 import pytest
 import torch
 
 from napari_fiberburst import reconstruct
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.diagnose import diagnose
-from napari_fiberburst.quality import psnr
 from napari_fiberburst.scene.smear import Smear
 from napari_fiberburst.scene.solve import Scene
 from napari_fiberburst.scene.spline import assemble
-from napari_fiberburst.simulation import Camera, Faults, simulate
-
-SHAPE = (137, 151)
-
-
-def recorded(smear):
-    return simulate(
-        "histology",
-        shape=SHAPE,
-        frames=14,
-        channels=1,
-        physics="core",
-        pitch=4.7,
-        seed=4,
-        camera=Camera(photons=8000, bits=10, exposure=0.8),
-        faults=Faults(smear=smear),
-    )
 
 
 def found(burst, monkeypatch):
@@ -42,14 +23,9 @@ def found(burst, monkeypatch):
     return reconstruct(burst), kept[0].smear
 
 
-def quality(result, simulated):
-    seen = np.isfinite(result.image)
-    return psnr(result.image[seen][None], simulated.truth[0, ..., 0][seen][None])
-
-
 @pytest.mark.parametrize("smear", [0.7, 1.0])
-def test_a_smear_is_found_and_its_blur_taken_out(smear, monkeypatch):
-    simulated = recorded(smear)
+def test_a_smear_is_found_and_its_blur_taken_out(smear, recorded, quality, monkeypatch):
+    simulated = recorded(frames=14, seed=4, smear=smear)
     result, told = found(simulated.burst, monkeypatch)
     assert told.part == pytest.approx(smear, abs=0.2)
     assert any("while they were exposed" in note for note in result.notes)
@@ -57,8 +33,8 @@ def test_a_smear_is_found_and_its_blur_taken_out(smear, monkeypatch):
     assert quality(result, simulated) > quality(reconstruct(simulated.burst), simulated) + 0.3
 
 
-def test_frames_that_rest_while_they_are_exposed_are_left_alone(monkeypatch):
-    result, told = found(recorded(0.0).burst, monkeypatch)
+def test_frames_that_rest_while_they_are_exposed_are_left_alone(recorded, monkeypatch):
+    result, told = found(recorded(frames=14, seed=4).burst, monkeypatch)
     assert told is None
     assert not any("exposed" in note for note in result.notes)
 

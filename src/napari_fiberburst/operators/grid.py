@@ -69,6 +69,10 @@ class Grid:
         """Return the operator that samples the means of images along paths (..., K, 2) of K points."""
         return PathSampling(self, paths)
 
+    def of_looks(self, looks: Tensor) -> "Sampling | PathSampling":
+        """Return the operator of samples that look at points (N, 2), or along paths (N, K, 2)."""
+        return self.at(looks) if looks.dim() == 2 else self.along(looks)
+
 
 class Sampling:
     """Bilinear interpolation at fixed points: calling it samples an image, its adjoint splats values onto the nodes.

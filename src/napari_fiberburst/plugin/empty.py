@@ -1,6 +1,5 @@
 """What the dock shows while there is no burst: ways to open one."""
 
-import logging
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,13 +11,11 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog, QLabel, QMenu, QPushButton, QVBoxLayout, QWidget
 from superqt.utils import create_worker
 
-from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.io.read import ARCHIVE_ENDINGS
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
 from napari_fiberburst.plugin.contributions import PLUGIN, LayerData, read
+from napari_fiberburst.plugin.problems import why
 from napari_fiberburst.plugin.sections import row_of
-
-logger = logging.getLogger(__name__)
 
 _FILES = " ".join(f"*{ending}" for ending in (*TIFF_ENDINGS, *ARCHIVE_ENDINGS))
 _INVITATION = "Open the frames of a burst: 10 to 20 that moved a little. Or drop them on the window."
@@ -95,11 +92,7 @@ class EmptyBox(QWidget):
             self._viewer.add_layer(Layer.create(data, look, kind))
 
     def _take_error(self, error: Exception) -> None:
-        why = str(error)
-        if not isinstance(error, FiberBurstError):
-            logger.error("a burst could not be opened", exc_info=error)
-            why = f"{type(error).__name__}: {error}"
-        self._set_busy(is_busy=False, words=why)
+        self._set_busy(is_busy=False, words=why(error, "a burst could not be opened"))
 
     def _set_busy(self, *, is_busy: bool, words: str) -> None:
         for button in (self.open_button, self.folder_button, self.sample_button):

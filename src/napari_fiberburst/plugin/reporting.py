@@ -1,6 +1,5 @@
 """A button that writes the report of a run, and what has come of it."""
 
-import logging
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,12 +8,10 @@ from qtpy.QtCore import Qt, QUrl
 from qtpy.QtWidgets import QFileDialog, QLabel, QPushButton, QVBoxLayout, QWidget
 from superqt.utils import create_worker
 
-from napari_fiberburst.errors import FiberBurstError
+from napari_fiberburst.plugin.problems import why
 
 if TYPE_CHECKING:
     from napari_fiberburst.plugin.runs import KeptRun
-
-logger = logging.getLogger(__name__)
 
 # Of a link, in both themes: Qt's own cannot be read on dark grey.
 _LINK = "#3d85e0"
@@ -80,11 +77,7 @@ class ReportBox(QWidget):
         self._end(f'is in <a href="{escape(link)}" style="color: {_LINK}">{escape(str(path))}</a>')
 
     def _take_error(self, error: Exception) -> None:
-        why = str(error)
-        if not isinstance(error, FiberBurstError):
-            logger.error("the report failed", exc_info=error)
-            why = f"{type(error).__name__}: {error}"
-        self._end(f"was not written: {escape(why)}")
+        self._end(f"was not written: {escape(why(error, 'the report failed'))}")
 
     def _end(self, what_became: str) -> None:
         name = "" if self._writing is None else self._writing.name

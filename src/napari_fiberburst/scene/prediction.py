@@ -55,7 +55,7 @@ def predict(
         values, places = samples.values[frame], points[frame]
         if among is not None:
             values, places, weights = values[chosen], places[chosen], weights[chosen]
-        sampling = grid.at(places) if places.dim() == 2 else grid.along(places)
+        sampling = grid.of_looks(places)
         yield Prediction(frame, values, sampling.of_channels(filtered), weights * sampling.inside)
 
 

@@ -28,7 +28,7 @@ from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.cg import Blocks, conjugate_gradients, inner_of_images
 from napari_fiberburst.operators.filters import blur, filled_mean
 from napari_fiberburst.operators.footprint import Footprint
-from napari_fiberburst.operators.grid import Grid, PathSampling
+from napari_fiberburst.operators.grid import Grid, PathSampling, Sampling
 from napari_fiberburst.operators.priors import MEMBRANE, THIN_PLATE, SmoothnessPrior
 from napari_fiberburst.operators.stencil import Stencil
 
@@ -83,24 +83,17 @@ class NormalEquations:
         Paths are (..., K, 2).
         """
         used = weights > 0
-        points, values, weights = points[used], values[used], weights[used]
-        if points.dim() == 3:
-            return self._with_paths(points, values, weights)
-        sampling = self.grid.at(points)
-        rhs = torch.stack(
-            [light + sampling.adjoint(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
-        )
-        return replace(self, bands=self.bands + sampling.normal(weights).bands, rhs=rhs)
-
-    def _with_paths(self, paths: Tensor, values: Tensor, weights: Tensor) -> "NormalEquations":
-        sampling = self.grid.along(paths)
+        looks, values, weights = points[used], values[used], weights[used]
+        sampling = self.grid.of_looks(looks)
         weights = weights * sampling.inside
-        middle = self.grid.at(paths[:, paths.shape[1] // 2])
         rhs = torch.stack(
             [light + sampling.adjoint(channel * weights) for channel, light in zip(values.T, self.rhs, strict=True)]
         )
-        bands = self.bands + middle.normal(weights).bands
-        return replace(self, bands=bands, rhs=rhs, paths=(*self.paths, (sampling, weights)))
+        if isinstance(sampling, Sampling):
+            return replace(self, bands=self.bands + sampling.normal(weights).bands, rhs=rhs)
+        middle = self.grid.at(looks[:, looks.shape[1] // 2])
+        paths = (*self.paths, (sampling, weights))
+        return replace(self, bands=self.bands + middle.normal(weights).bands, rhs=rhs, paths=paths)
 
     def __add__(self, other: "NormalEquations") -> "NormalEquations":
         paths = (*self.paths, *other.paths)
