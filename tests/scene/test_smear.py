@@ -65,3 +65,9 @@ class _Plain:
 
     def __init__(self, values, weights):
         self.values, self.weights = values, weights
+
+
+def test_frames_that_are_left_out_do_not_count_as_resting():
+    steps = torch.zeros(4, 3, 2)
+    steps[:2] = torch.tensor([3.0, 4.0])
+    assert Smear(0.5, steps).length == pytest.approx(2.5)

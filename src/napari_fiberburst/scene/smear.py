@@ -49,8 +49,9 @@ class Smear:
 
     @property
     def length(self) -> float:
-        """How far samples moved, pixels (root mean square)."""
-        return self.part * float(steady.mean(self.steps.square().sum(dim=2)).sqrt())
+        """How far samples moved in frames that take part, pixels (root mean square)."""
+        moved = self.steps[self.steps.flatten(1).any(dim=1)]  # those left out have no steps
+        return self.part * float(steady.mean(moved.square().sum(dim=2)).sqrt())
 
     def paths(self, points: Tensor) -> Tensor:
         """Return where samples looked that were at points (T, N, 2) in the middle, (T, N, K, 2)."""
