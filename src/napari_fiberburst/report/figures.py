@@ -13,6 +13,8 @@ from napari_fiberburst.io.picture import encode_png
 # Of a chart, in its own units, which are pixels where it is shown as large as it was drawn.
 _WIDTH, _HEIGHT = 440, 250
 _LEFT, _RIGHT, _TOP, _BOTTOM = 66, 12, 12, 44
+# As wide is the label of a line, which stands to the right of it where there is room: curves fall from the left.
+_LABEL = 110
 # A curve of more points than this cannot be seen to have them.
 _MOST_POINTS = 400
 # A scale bar takes at most this part of a picture's width, and text this part of its larger side.
@@ -92,7 +94,7 @@ class Chart:
     def mark_x(self, x: float, label: str) -> None:
         """Add a line from top to bottom, and what it stands for."""
         at = self._x(x)
-        side = "end" if at > (_WIDTH + _LEFT) / 2 else "start"
+        side = "end" if at > _WIDTH - _RIGHT - _LABEL else "start"
         shift = -5 if side == "end" else 5
         self._parts.append(
             f'<path class="mark" d="M{at:.1f} {_TOP}V{_HEIGHT - _BOTTOM}"/>'
