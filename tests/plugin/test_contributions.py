@@ -117,7 +117,7 @@ def test_a_result_layer_is_written_with_its_provenance(open_dock, run_through, b
     assert tifffile.imread(written[0]).shape == (3, 63, 75)
     assert json.loads((tmp_path / "out.json").read_text())["ending"] == "finished"
     # napari gives the writer other images too.
-    dock.display.card.switches["coverage"].setChecked(True)
+    dock.picture.display.card.switches["coverage"].setChecked(True)
     viewer.layers["run 1: coverage"].save(str(tmp_path / "coverage.ome.tif"))
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "coverage.ome.tif"), viewer.layers["run 1: coverage"].data)
     contributions.write(str(tmp_path / "b.ome.tif"), *burst_layer.as_layer_data_tuple()[:2])
@@ -130,10 +130,10 @@ def test_the_layers_menu_registers_and_reconstructs(make_napari_viewer, qtbot, b
     viewer.add_layer(burst_layer)
     contributions.register_layer()
     (dock,) = viewer.window.dock_widgets.values()
-    with qtbot.waitSignal(dock.display.complete, timeout=60_000):
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=60_000):
         pass
     assert viewer.layers["run 1: stabilised burst"].visible
-    assert dock.display.card.switches["stabilised burst"].isChecked()
+    assert dock.picture.display.card.switches["stabilised burst"].isChecked()
     assert not viewer.layers["run 1: image"].visible
 
 
@@ -151,14 +151,14 @@ def test_preferences_come_from_naparis_page(plugin_settings, npe2pm):
 def test_results_are_saved_from_the_list_of_runs(open_dock, run_through, burst_layer, tmp_path):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
-    dock.runs.save_result(run, tmp_path / "p.ome.tif")
-    dock.runs.save_homographies(run, tmp_path / "h.csv")
-    dock.runs.save_homographies(run, tmp_path / "h.json")
+    dock.picture.runs.save_result(run, tmp_path / "p.ome.tif")
+    dock.picture.runs.save_homographies(run, tmp_path / "h.csv")
+    dock.picture.runs.save_homographies(run, tmp_path / "h.json")
     table = np.loadtxt(tmp_path / "h.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(table[:, 1:].reshape(-1, 3, 3), run.result.homographies)
     stored = json.loads((tmp_path / "h.json").read_text())["frames"]
     np.testing.assert_array_equal([frame["homography"] for frame in stored], run.result.homographies)
     assert (tmp_path / "p.json").exists()
     before = sorted(tmp_path.iterdir())
-    dock.runs.save_homographies(run, tmp_path / "h.txt")
+    dock.picture.runs.save_homographies(run, tmp_path / "h.txt")
     assert sorted(tmp_path.iterdir()) == before

@@ -15,6 +15,7 @@ from napari_fiberburst.io.read import ARCHIVE_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.data.burst import Burst
 
 LayerData = tuple[Any, dict[str, Any], str]
@@ -83,9 +84,7 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 
 
 def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
-    """Open a bundle as its transmission, with the bundle itself in the metadata, and its cores as points.
-
-    Points are as large as a core's footprint. Saturated cores are red, dead ones blue.
+    """Open a bundle as the layers of `bundle_layers`.
 
     Raises
     ------
@@ -94,13 +93,29 @@ def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
     """
     from napari_fiberburst.bundle.bundle import Bundle
 
-    bundle, name = Bundle.load(str(path)), Path(str(path)).stem
+    return bundle_layers(Bundle.load(str(path)), Path(str(path)).stem, path=str(path))
+
+
+def bundle_layers(bundle: "Bundle", name: str, *, path: str | None = None) -> list[LayerData]:
+    """Return a bundle as its transmission, with the bundle itself in the metadata, and its cores as points.
+
+    Points are as large as a core's footprint. Saturated cores are red, dead ones blue.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        What to show.
+    name : str
+        Of the layer.
+    path : str, optional
+        The file that holds it.
+    """
     bright = float(np.quantile(bundle.transmission[bundle.outline], _BRIGHTEST)) if bundle.outline.any() else 1.0
     look = {
         "name": name,
         "axis_labels": ("y", "x"),
         "contrast_limits": (0.0, max(bright, 1e-6)),
-        "metadata": {METADATA_KEY: {"bundle": bundle, "path": str(path)}},
+        "metadata": {METADATA_KEY: {"bundle": bundle, "path": path}},
     }
     layers: list[LayerData] = [(bundle.transmission, look, "image")]
     if bundle.is_resolved:

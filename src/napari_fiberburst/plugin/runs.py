@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.results.reconstruction import Reconstruction
 
-_LINES_OF_RUNS = 4
+_LINES_OF_RUNS = 3
 _MORE_STEPS = 200
 _NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
 # What a row tells of a run, and in more words.
