@@ -23,8 +23,8 @@ def bundle_task(open_dock, burst_layer):
 
 
 def calibrate(task, qtbot):
-    task.calibrate_button.click()
-    assert not task.calibrate_button.isEnabled()
+    task.start_button.click()
+    assert not task.start_button.isEnabled()
     qtbot.waitUntil(lambda: not task.words.text().startswith("Measuring"), timeout=MILLISECONDS)
 
 
@@ -77,7 +77,7 @@ def test_a_bundle_is_kept_in_a_file_and_serves_the_next_burst(bundle_task, qtbot
     _, dock, task = bundle_task
     assert not task.keep_button.isEnabled()
     calibrate(task, qtbot)
-    assert not task.calibrate_button.isEnabled()
+    assert not task.start_button.isEnabled()
     path = tmp_path / "probe.bundle"
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_: (str(path), ""))
     task.keep_button.click()
@@ -94,4 +94,4 @@ def test_what_shows_no_bundle_is_said(bundle_task, qtbot):
     calibrate(task, qtbot)
     assert "no bundle is seen" in task.words.text()
     assert dock.input.bundle.value is None
-    assert task.calibrate_button.isEnabled()
+    assert task.start_button.isEnabled()

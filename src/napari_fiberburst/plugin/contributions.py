@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 LayerData = tuple[Any, dict[str, Any], str]
 PLUGIN = "napari-fiberburst"
-_WIDGET = "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
 # What a file of a simulated burst holds of the recording; all else is truth.
@@ -191,19 +190,17 @@ def _start(show: str) -> None:
     import napari
     from napari.utils.notifications import show_error
 
-    from napari_fiberburst.plugin.dock import FiberBurstWidget
+    from napari_fiberburst.plugin.commands import find_dock
 
     viewer = napari.current_viewer()
     if viewer is None:
         return
     layer = viewer.layers.selection.active
-    # From the menu, napari opens the dock under another name than from here.
-    open_already = [widget for widget in viewer.window.dock_widgets.values() if isinstance(widget, FiberBurstWidget)]
-    widget = open_already[0] if open_already else viewer.window.add_plugin_dock_widget(PLUGIN, _WIDGET)[1]
+    dock = find_dock(viewer, may_open=True)
     if layer is None:
         show_error("no layer is selected; select the burst's layer")
-    else:
-        widget.start_on(layer, show)
+    elif dock is not None:
+        dock.start_on(layer, show)
 
 
 def _holds_frames(folder: Path) -> bool:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from qtpy.QtCore import QEvent, QSize
 from qtpy.QtWidgets import QTabBar, QVBoxLayout, QWidget
 
+from napari_fiberburst.plugin.commands import KeyHints, bind_keys
 from napari_fiberburst.plugin.empty import EmptyBox
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.pickers import WheelFilter
@@ -52,6 +53,8 @@ class FiberBurstWidget(QWidget):
         self.input.changed.connect(self._show_or_invite)
         for task in self.tasks:
             task.kept_changed.connect(self._show_or_invite)
+        bind_keys()
+        KeyHints(self)
         self._show_task(0)
         self._show_or_invite()
 
@@ -59,6 +62,11 @@ class FiberBurstWidget(QWidget):
     def picture(self) -> PictureTask:
         """The task that reconstructs, which commands of the Layers menu start."""
         return next(task for task in self.tasks if isinstance(task, PictureTask))
+
+    @property
+    def task(self) -> Task:
+        """The task that is shown."""
+        return self.tasks[self.task_bar.currentIndex()]
 
     def choose_task(self, kind: type[Task]) -> None:
         """Show the task of a kind."""

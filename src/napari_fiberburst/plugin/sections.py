@@ -1,4 +1,4 @@
-"""How the dock is laid out: sections that fold away, rows, and the button to press first."""
+"""How the dock is laid out: sections that fold away, rows."""
 
 from typing import Any
 
@@ -8,8 +8,6 @@ from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QScrollArea, QVBoxLayout, Q
 from superqt import QCollapsible
 
 _ABOVE_CONTENT, _BELOW_CONTENT = 4, 10
-# How a task's first button looks.
-FIRST_THING_TO_PRESS = "QPushButton:enabled { background-color: #2f6fd0; color: white; font-weight: bold; }"
 
 
 class _Section(QCollapsible):

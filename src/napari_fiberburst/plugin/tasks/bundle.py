@@ -16,7 +16,6 @@ from napari_fiberburst.plugin.contributions import bundle_layers
 from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.problems import why
-from napari_fiberburst.plugin.sections import FIRST_THING_TO_PRESS
 from napari_fiberburst.plugin.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -35,8 +34,8 @@ class BundleTask(Task):
 
     Attributes
     ----------
-    calibrate_button, keep_button : QPushButton
-        What can be done with it now.
+    keep_button : QPushButton
+        Saves the bundle that is chosen.
     words, numbers : QLabel
         What will be measured, or what has been; and what the bundle has.
     """
@@ -47,10 +46,11 @@ class BundleTask(Task):
     def __init__(self, viewer: "napari.viewer.Viewer", source: InputBox, parent: QWidget | None = None) -> None:
         super().__init__(viewer, source, parent)
         self._measuring = ""
-        self.calibrate_button, self.keep_button = QPushButton("Calibrate"), QPushButton("Keep this bundle…")
+        self.start_button.setText("Calibrate")
+        self.keep_button = QPushButton("Keep this bundle…")
         self.words, self.numbers = QLabel(), QLabel()
         self._lay_out()
-        self.calibrate_button.clicked.connect(self.calibrate)
+        self.start_button.clicked.connect(self.calibrate)
         self.keep_button.clicked.connect(self._ask_and_keep)
         source.changed.connect(self._take_input)
         self._take_input()
@@ -109,7 +109,7 @@ class BundleTask(Task):
         self.words.setText(words)
         self.numbers.setText("" if known is None else _as_table(known))
         self.numbers.setVisible(known is not None)
-        self.calibrate_button.setEnabled(not self._measuring and known is None)
+        self.start_button.setEnabled(not self._measuring and known is None)
         self.keep_button.setEnabled(not self._measuring and known is not None)
         self.kept_changed.emit()
 
@@ -122,15 +122,14 @@ class BundleTask(Task):
                 self.keep(path)
 
     def _lay_out(self) -> None:
-        self.calibrate_button.setStyleSheet(FIRST_THING_TO_PRESS)
-        self.calibrate_button.setToolTip("Measure where the cores are, and how much light each passes.")
+        self.start_button.setToolTip("Measure where the cores are, and how much light each passes.")
         self.keep_button.setToolTip("Save the bundle to a file, for other bursts through the same probe.")
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
         for label in (self.words, self.numbers):
             label.setWordWrap(True)
             label.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
-        for widget in (self.calibrate_button, self.words, self.numbers, self.keep_button):
+        for widget in (self.start_button, self.words, self.numbers, self.keep_button):
             column.addWidget(widget)
 
 

@@ -28,7 +28,7 @@ from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
 from napari_fiberburst.plugin.runner import Runner, wait_for_workers
 from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
-from napari_fiberburst.plugin.sections import FIRST_THING_TO_PRESS, row_of, section
+from napari_fiberburst.plugin.sections import row_of, section
 from napari_fiberburst.plugin.tasks.task import Task
 from napari_fiberburst.settings import SplineMethod, choose
 
@@ -56,7 +56,6 @@ class PictureTask(Task):
         self.runner = Runner(self)
         self.runs = RunsPanel()
         self.display = Display(viewer, self)
-        self.start_button = QPushButton("Start")
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
@@ -268,7 +267,6 @@ class PictureTask(Task):
         self.form.show_devices(missing)
 
     def _lay_out(self) -> None:
-        self.start_button.setStyleSheet(FIRST_THING_TO_PRESS)
         self.start_button.setToolTip("Reconstruct the burst; everything sets itself.")
         self.stop_button.setToolTip("End the run; what it has come to is kept.")
         self.pause_button.setToolTip("Hold the run where it is.")

@@ -3,12 +3,14 @@
 from typing import TYPE_CHECKING, ClassVar
 
 from qtpy.QtCore import Signal
-from qtpy.QtWidgets import QWidget
+from qtpy.QtWidgets import QPushButton, QWidget
 
 from napari_fiberburst.plugin.input_box import InputBox
 
 if TYPE_CHECKING:
     import napari
+
+_FIRST_THING_TO_PRESS = "QPushButton:enabled { background-color: #2f6fd0; color: white; font-weight: bold; }"
 
 
 class Task(QWidget):
@@ -28,6 +30,8 @@ class Task(QWidget):
     ----------
     title, tip : str
         How the task is called, and what it does.
+    start_button : QPushButton
+        Starts it.
     """
 
     title: ClassVar[str]
@@ -38,6 +42,8 @@ class Task(QWidget):
         super().__init__(parent)
         self._viewer = viewer
         self.input = source
+        self.start_button = QPushButton("Start")
+        self.start_button.setStyleSheet(_FIRST_THING_TO_PRESS)
 
     @property
     def is_empty(self) -> bool:
