@@ -37,7 +37,10 @@ def run(options: argparse.Namespace) -> int:
         check_place(options.output)
     if is_bundle:
         return _of_bundle(options.input, options.output)
+    from napari_fiberburst.pipeline.glance import glance  # torch takes seconds to load
+
     burst = read_burst(options.input, axes=options.axes)
+    seen = glance(burst)
     count, height, width, channels = burst.shape
     size = "unknown"
     if burst.pixel_size is not None:
@@ -52,6 +55,8 @@ def run(options: argparse.Namespace) -> int:
         ("brightest", f"{burst.frames.max() * (burst.white_level - burst.black_level) + burst.black_level:g}"),
         ("pixel size", size),
         ("times", times),
+        ("shows", seen.words),
+        *(("note", warning) for warning in seen.warnings),
     ):
         print(f"{name:15} {value}")
     return 0

@@ -7,6 +7,7 @@ from qtpy.QtWidgets import QTabBar, QVBoxLayout, QWidget
 
 from napari_fiberburst.plugin.commands import KeyHints, bind_keys
 from napari_fiberburst.plugin.empty import EmptyBox
+from napari_fiberburst.plugin.glance_box import GlanceBox
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.sections import Column
@@ -35,6 +36,8 @@ class FiberBurstWidget(QWidget):
         What is shown while there is no burst.
     input : InputBox
         The burst that is chosen.
+    glance : GlanceBox
+        What is seen of it.
     tasks : tuple of Task
         What can be done with it, one of `napari_fiberburst.plugin.tasks.TASKS` each.
     task_bar : QTabBar
@@ -46,6 +49,7 @@ class FiberBurstWidget(QWidget):
         self._was_docked = False
         self.empty, self.filled = EmptyBox(viewer), QWidget()
         self.input = InputBox(viewer)
+        self.glance = GlanceBox(self.input)
         self.tasks = tuple(kind(viewer, self.input) for kind in TASKS)
         self.task_bar = QTabBar()
         self._lay_out()
@@ -124,7 +128,7 @@ class FiberBurstWidget(QWidget):
         whole.addStretch(1)
         column = QVBoxLayout(self.filled)
         column.setContentsMargins(0, 0, 0, 0)
-        for widget in (self.task_bar, self.input, *self.tasks):
+        for widget in (self.task_bar, self.input, self.glance, *self.tasks):
             column.addWidget(widget)
         scroll = Column(content)
         WheelFilter(scroll)
