@@ -4,12 +4,13 @@ import logging
 
 import numpy as np
 import pytest
+import skimage.data
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst import Burst, load, reconstruct
 from napari_fiberburst.errors import BundleError, SettingsError
 from napari_fiberburst.quality import motion_error, psnr, ssim
-from napari_fiberburst.simulation import Camera, Faults, simulate
+from napari_fiberburst.simulation import Camera, Faults, Scene, simulate
 
 SHAPE = (127, 141)
 
@@ -27,6 +28,17 @@ def recorded(simulated, change):
     frames = simulated.arrays()["frames"].copy()
     change(frames)
     return Burst(frames, axes="TYXC", black_level=0, white_level=simulated.burst.white_level)
+
+
+@pytest.mark.parametrize("seed", [1, 733])
+def test_few_frames_far_apart_are_not_held_still_by_what_their_cores_differ_by(seed):
+    """Cores start as equal where frames are few; what really differs between them does not move."""
+    slide = skimage.data.immunohistochemistry().astype(np.float32) / 255
+    shape, chosen = (141, 167), [0, 1, 2, 3, 4, 6, 8, 11]
+    view = {"shape": shape, "frames": 12, "pitch": 3.5, "channels": 1, "motion": "handheld", "physics": "core"}
+    simulated = simulate(Scene(slide, (98, 225)), camera=Camera(photons=8000.0), seed=seed, **view)
+    result = reconstruct(Burst(simulated.burst.frames[chosen], axes="TYXC"))
+    assert motion_error(result.homographies, simulated.homographies[chosen], shape) < 0.1
 
 
 def test_without_motion_it_says_so_and_shows_one_frames_worth():

@@ -72,11 +72,12 @@ def calibrate(burst: Burst, *, device: str = "auto") -> Bundle:
     """
     frames = torch.from_numpy(burst.frames).to(find_device(device))
     grey = frames.mean(dim=3)
-    return drain(calibrating(grey, burst, find_marks(only_exposed(grey))))
+    bundle = drain(calibrating(grey, burst, find_marks(only_exposed(grey))))
+    return with_even_gains(bundle) if shows_the_object(bundle, grey, burst) else bundle
 
 
 def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Generator[str, None, Bundle]:
-    """Calibrate the bundle from grey frames (T, H, W) in [0, 1] with marks (H, W) burned into them.
+    """Calibrate the bundle from the mean of grey frames (T, H, W) in [0, 1] with marks (H, W) burned into them.
 
     Yields the name of each step that is done.
     """
@@ -86,14 +87,16 @@ def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Genera
     field = find_field(grey, find_pitch(mean))
     mean = torch.where(marks, local_mean(mean, _FILLED_FROM, (~marks).to(mean)), mean)
     bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin, field)), grey)
-    bundle = bundle.masked(marks.cpu().numpy())
-    if bundle.is_resolved and len(grey) <= _FEW_FRAMES:
-        samples = sample_cores(grey[..., None], bundle, acquisition)
-        light = samples.values[..., 0]
-        contrast = float((light.std(dim=0) / light.mean(dim=0).abs().clamp_min(1e-6)).median()) if len(light) > 1 else 0
-        if contrast > _MUCH_CONTRAST:
-            bundle = with_even_gains(bundle)
-    return bundle
+    return bundle.masked(marks.cpu().numpy())
+
+
+def shows_the_object(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> bool:
+    """Whether gains that were taken from the mean of grey frames (T, H, W) are likely to hold the object as well."""
+    grey = only_exposed(grey)
+    if not bundle.is_resolved or bundle.gains_known or not 1 < len(grey) <= _FEW_FRAMES:
+        return False
+    light = sample_cores(grey[..., None], bundle, acquisition).values[..., 0]
+    return float((light.std(dim=0) / light.mean(dim=0).abs().clamp_min(1e-6)).median()) > _MUCH_CONTRAST
 
 
 def calibrating_mean(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, with_even_gains
+from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, shows_the_object, with_even_gains
 from napari_fiberburst.bundle.field import find_marks, widened
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
@@ -163,7 +163,9 @@ class Stages:
             self._taken = None
             steadied = (_warned(mount.note),)
         yield None
-        bundle, notes = yield from self._calibrate(mount)
+        by_mean, notes = yield from self._calibrate(mount)
+        is_even = shows_the_object(by_mean, self._grey, self._burst)
+        bundle = with_even_gains(by_mean) if is_even else by_mean
         samples = _seen(self._cores(bundle, self._grey[..., None]), mount)
         fitted = Fitted(
             bundle=bundle,
@@ -176,7 +178,9 @@ class Stages:
         yield fitted
         fitted = replace(fitted, noise=self._noise(bundle, samples, mount))
         fitted = yield from self._register(fitted, samples)
-        return (yield from self._from_equal_gains(fitted)) if self._is_start_in_doubt(fitted) else fitted
+        if not self._is_start_in_doubt(fitted, is_even):
+            return fitted
+        return (yield from self._better_of(fitted, by_mean if is_even else with_even_gains(by_mean)))
 
     def _noise(self, bundle: Bundle, samples: Samples, mount: Mount | None) -> Noise | None:
         """Measure the camera's noise in frames that are as they were recorded."""
@@ -273,18 +277,21 @@ class Stages:
         yield fitted
         return fitted
 
-    def _is_start_in_doubt(self, fitted: Fitted) -> bool:
-        """Whether the mean frame may have shown the object for gains: it hardly moves, or is not explained."""
+    def _is_start_in_doubt(self, fitted: Fitted, is_even: bool) -> bool:
+        """Whether gains and object may have been taken for one another.
+
+        The object hardly moves, or is not explained; or cores have started as equal, and what differs between them has
+        passed for an object that stands still.
+        """
         bundle, found = fitted.bundle, fitted.registration
         most = self._method.iterations
         is_spent = most is not None and found.iterations >= most
         if not bundle.is_resolved or bundle.gains_known or found.is_still or is_spent:
             return False
-        return found.travel < _SHORT_TRAVEL * bundle.pitch or found.unexplained > MOST_UNEXPLAINED
+        return is_even or found.travel < _SHORT_TRAVEL * bundle.pitch or found.unexplained > MOST_UNEXPLAINED
 
-    def _from_equal_gains(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
-        """Register once more from equal gains, and keep that start whose samples predict one another better."""
-        bundle = with_even_gains(fitted.bundle)
+    def _better_of(self, fitted: Fitted, bundle: Bundle) -> Generator[Fitted, None, Fitted]:
+        """Register once more from other gains, and keep that start whose samples predict one another better."""
         samples = _seen(self._cores(bundle, self._grey[..., None]), fitted.mount)
         again = replace(fitted, bundle=bundle, registration=unregistered(samples), scene=None, image=None)
         steps = self._register(again, samples)
