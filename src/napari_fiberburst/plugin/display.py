@@ -13,7 +13,7 @@ from napari_fiberburst.plugin.card import ResultCard
 from napari_fiberburst.plugin.curves import Curves
 from napari_fiberburst.plugin.history import HistoryEntry
 from napari_fiberburst.plugin.job import Job
-from napari_fiberburst.plugin.runs import KeptRun
+from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.sections import section
 
 if TYPE_CHECKING:

@@ -30,12 +30,13 @@ from napari_fiberburst.plugin.empty import EmptyBox
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
+from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
 from napari_fiberburst.plugin.runner import Runner, wait_for_workers
-from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
+from napari_fiberburst.plugin.runs import RunsPanel
 from napari_fiberburst.plugin.sections import Column, row_of, section
 from napari_fiberburst.settings import SplineMethod, choose
 

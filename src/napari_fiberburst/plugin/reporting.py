@@ -11,7 +11,7 @@ from superqt.utils import create_worker
 from napari_fiberburst.plugin.problems import why
 
 if TYPE_CHECKING:
-    from napari_fiberburst.plugin.runs import KeptRun
+    from napari_fiberburst.plugin.kept_run import KeptRun
 
 # Of a link, in both themes: Qt's own cannot be read on dark grey.
 _LINK = "#3d85e0"
