@@ -381,20 +381,6 @@ def test_a_row_tells_what_came_of_its_run(open_dock, run_through, burst_layer):
     assert float(cells[4]) == pytest.approx(result.held_out_rmse, rel=0.01)
 
 
-def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
-    viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices(QUICK)
-    for _ in range(3):
-        run_through(dock)
-    dock.runs.select(dock.runs.runs[0])
-    dock.runs.other.setCurrentIndex(1)
-    dock.runs.compare_button.click()
-    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 2, 3)] == [False, True, False]
-    dock.runs.remove(dock.runs.runs[1])
-    assert not dock.runs.compare_button.isChecked()
-    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 3)] == [True, False]
-
-
 def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_through):
     bent = simulate(
         "histology",

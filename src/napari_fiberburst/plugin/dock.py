@@ -72,7 +72,7 @@ class FiberBurstWidget(QWidget):
         self.input = InputBox(viewer)
         self.form = SettingsForm()
         self.runner = Runner(self)
-        self.runs = RunsPanel()
+        self.runs = RunsPanel(viewer)
         self.display = Display(viewer, self)
         self.start_button = QPushButton("Start")
         self.pause_button = QPushButton("Pause")
@@ -122,6 +122,7 @@ class FiberBurstWidget(QWidget):
 
     def shut_down(self) -> None:
         """Stop what is running and let go of the viewer. May be called more than once."""
+        self.runs.compare.stop()
         _let_go(self.runner, self.display, self._throttle)
 
     def reset_choices(self) -> None:

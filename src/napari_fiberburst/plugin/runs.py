@@ -1,8 +1,10 @@
 """The runs that are kept, and what can be done with them."""
 
+from napari.components import ViewerModel
 from qtpy.QtCore import Signal
-from qtpy.QtWidgets import QComboBox, QPushButton, QSpinBox, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QPushButton, QSpinBox, QVBoxLayout, QWidget
 
+from napari_fiberburst.plugin.compare import CompareBox
 from napari_fiberburst.plugin.evidence import MOTION_KINDS
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.runs_table import RunsTable
@@ -14,22 +16,24 @@ _MORE_STEPS = 200
 
 
 class RunsPanel(QWidget):
-    """The table of runs, and what can be done with them."""
+    """The table of runs, and what can be done with them.
+
+    Parameters
+    ----------
+    viewer : ViewerModel
+        Where their layers are.
+    """
 
     chosen = Signal(object)  # KeptRun or None
     continue_asked = Signal(object, int)  # KeptRun, steps
     removed = Signal(object)  # KeptRun
 
-    def __init__(self, parent: QWidget | None = None) -> None:
+    def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._runs: list[KeptRun] = []  # newest first
         self._is_running = False
         self.table = RunsTable()
-        self.other = QComboBox()
-        self.other.setToolTip("The run to compare with the one selected above.")
-        self.compare_button = QPushButton("A / B")
-        self.compare_button.setCheckable(True)
-        self.compare_button.setToolTip("Show the run selected above (A), or the one beside this button (B).")
+        self.compare = CompareBox(viewer)
         self.remove_button = QPushButton("Remove")
         self.remove_button.setToolTip("Forget this run and take its layers out of the viewer.")
         self.continue_button = QPushButton("Continue for")
@@ -69,7 +73,7 @@ class RunsPanel(QWidget):
 
     def remove(self, run: KeptRun) -> None:
         """Forget a run and take its layers away."""
-        self.compare_button.setChecked(False)
+        self.compare.stop()
         self.table.take_out(run)
         self._runs.remove(run)
         run.layers.remove()
@@ -89,15 +93,13 @@ class RunsPanel(QWidget):
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.table)
-        layout.addLayout(row_of(self.compare_button, self.other, self.remove_button))
-        layout.addLayout(row_of(self.continue_button, self._more_steps))
+        layout.addWidget(self.compare)
+        layout.addLayout(row_of(self.continue_button, self._more_steps, self.remove_button))
         layout.addWidget(self.save)
 
     def _connect(self) -> None:
         self.table.chosen.connect(self._take_choice)
         self.table.renamed.connect(self._rename)
-        self.compare_button.toggled.connect(self._show_a_or_b)
-        self.other.activated.connect(lambda _: self._show_a_or_b(self.compare_button.isChecked()))
         self.remove_button.clicked.connect(lambda: self.remove(self.run) if self.run is not None else None)
         self.continue_button.clicked.connect(lambda: self.continue_asked.emit(self.run, self._more_steps.value()))
 
@@ -108,16 +110,7 @@ class RunsPanel(QWidget):
         has_result = result is not None
         self.save.show_run(run)
         self.remove_button.setEnabled(has_result or (run is not None and not self._is_running))
-        others = [other for other in self._runs if other is not run]
-        self.other.blockSignals(True)
-        before = self.other.currentData()
-        self.other.clear()
-        for other in others:
-            self.other.addItem(other.name, other)
-        if before in others:
-            self.other.setCurrentIndex(others.index(before))
-        self.other.blockSignals(False)
-        self.compare_button.setEnabled(bool(others))
+        self.compare.offer(run, [other for other in self._runs if other is not run])
         is_network = result is not None and not isinstance(result.settings.method, SplineMethod)
         self.continue_button.setEnabled(is_network and not self._is_running)
         self._more_steps.setEnabled(is_network and not self._is_running)
@@ -128,7 +121,6 @@ class RunsPanel(QWidget):
         )
 
     def _take_choice(self) -> None:
-        self.compare_button.setChecked(False)
         self._follow()
         self.chosen.emit(self.run)
 
@@ -137,10 +129,3 @@ class RunsPanel(QWidget):
             run.name = name
             run.layers.rename(name)
         self.refresh()
-
-    def _show_a_or_b(self, is_b: bool) -> None:
-        """Show the image of one run, A or B, and hide those of all others."""
-        self.compare_button.setText("B / A" if is_b else "A / B")
-        shown = self.other.currentData() if is_b else self.run
-        for run in self._runs:
-            run.layers.set_visible("image", run is shown)
