@@ -19,6 +19,7 @@ from napari_fiberburst.plugin.dock import FiberBurstWidget
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.placement import Placement
+from napari_fiberburst.plugin.runs import RunsPanel
 from napari_fiberburst.simulation import SimulatedBurst, simulate
 
 MILLISECONDS = 60_000
@@ -124,3 +125,23 @@ def kept_run() -> Callable[..., KeptRun]:
         return run
 
     return kept
+
+
+@pytest.fixture(scope="session")
+def grey_result(tiny_simulation, fit):
+    """Return a result of grey frames; its image is the tests' to replace."""
+    return fit(tiny_simulation.arrays()["frames"][..., 1], iterations=1)
+
+
+@pytest.fixture
+def viewer():
+    """Return a viewer without a window."""
+    return ViewerModel()
+
+
+@pytest.fixture
+def panel(qtbot, viewer):
+    """Return a panel of the runs in it."""
+    made = RunsPanel(viewer)
+    qtbot.addWidget(made)
+    return made

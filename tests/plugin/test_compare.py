@@ -4,22 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 from napari.layers import Image
 
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.plugin.runs import RunsPanel
 
 HEIGHT, WIDTH = 31, 37
 FIELD = Canvas.over((0, 0, WIDTH, HEIGHT))
 # Twice as fine, and two pixels further to the left and three to the bottom.
 FINER = Canvas.over((-2, 0, WIDTH, HEIGHT + 3), scale=2)
-
-
-@pytest.fixture(scope="session")
-def grey_result(tiny_simulation, fit):
-    """Return a result of grey frames; its image is the tests' to replace."""
-    return fit(tiny_simulation.arrays()["frames"][..., 1], iterations=1)
 
 
 @pytest.fixture(scope="session")
@@ -34,20 +26,6 @@ def ramp(canvas, colours=(), slope=1.0):
     values = 100 + slope * (points[..., 0] + 2 * points[..., 1])
     image = values if not colours else values[..., None] + 10 * np.arange(colours[0])
     return image.astype(np.float32)
-
-
-@pytest.fixture
-def viewer():
-    """Return a viewer without a window."""
-    return ViewerModel()
-
-
-@pytest.fixture
-def panel(qtbot, viewer):
-    """Return a panel of the runs in it."""
-    made = RunsPanel(viewer)
-    qtbot.addWidget(made)
-    return made
 
 
 @pytest.fixture

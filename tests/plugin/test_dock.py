@@ -186,8 +186,7 @@ def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock
         (plot,) = [
             plot for plot in dock.display.curve_box.findChildren(PlotWidget) if plot.getAxis("left").labelText == "loss"
         ]
-        seconds = plot.listDataItems()[0].getOriginalDataset()[0]
-        return [] if seconds is None else seconds
+        return plot.listDataItems()[0].getOriginalDataset()[0] if plot.listDataItems() else []
 
     dock.display.curve_box.expand(animate=False)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])

@@ -349,6 +349,7 @@ class FiberBurstWidget(QWidget):
         self.form.changed.connect(self._estimate)
         self.form.turned_live.connect(self._turn_live)
         self.runs.chosen.connect(self.display.select)
+        self.runs.charted.connect(self.display.chart)
         self.runs.removed.connect(self._forget)
         self.runs.continue_asked.connect(self.continue_run)
         self.runner.reported.connect(self._show)

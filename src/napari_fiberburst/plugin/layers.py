@@ -53,6 +53,7 @@ class RunLayers:
         self._viewer, self._name, self.placement = viewer, name, placement
         self._common = dict(metadata)
         self._layers: dict[str, Layer] = {}
+        self._places: dict[int, Layer] = {}
         self._is_removed = False
         self._drawn_at: NDArray[np.float64] | None = None
         self._limits: dict[str, tuple[float, float]] = {}
@@ -157,13 +158,26 @@ class RunLayers:
             if _is_of(name, kind) and self._has(layer):
                 layer.visible = visible
 
+    def take_out(self) -> None:
+        """Take all layers of the run out of the viewer, until they are put back."""
+        layers = self._viewer.layers
+        self._is_removed = True
+        self._places = {layers.index(layer): layer for layer in self._layers.values() if self._has(layer)}
+        for layer in self._places.values():
+            layers.remove(layer)
+
+    def put_back(self) -> None:
+        """Put the layers that were taken out back into their places."""
+        self._is_removed = False
+        for place, layer in sorted(self._places.items()):
+            self._add(layer, min(place, len(self._viewer.layers)))
+        self._places = {}
+
     def remove(self) -> None:
         """Take all layers of the run out of the viewer, for good."""
-        self._is_removed = True
-        for layer in self._layers.values():
-            if self._has(layer):
-                self._viewer.layers.remove(layer)
+        self.take_out()
         self._layers.clear()
+        self._places = {}
         self._result = self._frames = self._motion = None
 
     def _fit_contrast(self, kind: str, layer: Image, data: NDArray[np.float32]) -> None:
@@ -196,10 +210,13 @@ class RunLayers:
         layer.name = f"{self._name}: {kind}"
         layer.metadata = self._metadata()
         self._layers[kind] = layer
+        self._add(layer, len(self._viewer.layers) if at is None else at)
+
+    def _add(self, layer: Layer, at: int) -> None:
+        """Add a layer to the viewer; what the user works on stays selected."""
         layers = self._viewer.layers
         chosen = set(layers.selection)
-        layers.insert(len(layers) if at is None else at, layer)
-        # What the user works on stays selected.
+        layers.insert(at, layer)
         layers.selection = chosen or {layer}
 
     def _metadata(self, more: Mapping[str, Any] | None = None) -> dict[str, Any]:

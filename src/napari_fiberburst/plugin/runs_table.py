@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from qtpy.QtCore import Qt, Signal
+from qtpy.QtCore import QItemSelectionModel, QSize, Qt, Signal
 from qtpy.QtWidgets import QHeaderView, QTableWidget, QTableWidgetItem, QWidget
 
 from napari_fiberburst.plugin.kept_run import KeptRun
+from napari_fiberburst.plugin.thumbnails import icon_of
 
-_LINES_OF_RUNS = 4
+_LINES_OF_RUNS, _ICON = 3, 26
+_WHOLE_ROWS = QItemSelectionModel.SelectionFlag.Rows
 _NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
 # What a row tells of a run, and in more words.
 _COLUMNS = {
@@ -21,17 +23,22 @@ _COLUMNS = {
 
 
 class RunsTable(QTableWidget):
-    """Shows runs, the newest first until the user sorts them, and lets one be selected and renamed."""
+    """Shows runs, the newest first until the user sorts them, and lets them be selected and renamed."""
 
     chosen = Signal()  # another run is the current one, or none is
+    marked = Signal()  # other runs are selected
     renamed = Signal(object, str)  # KeptRun, what the user has typed
 
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(0, len(_COLUMNS), parent)
         self.setAccessibleName("runs")
-        self.setToolTip("The runs so far, the newest first; press a heading to sort them by it.")
+        self.setToolTip(
+            "The runs so far, the newest first; press a heading to sort them by it.\n"
+            "With Ctrl or Shift, several are selected: their curves are drawn together."
+        )
         self._lay_out()
         self.currentCellChanged.connect(lambda row, _, before, __: self.chosen.emit() if row != before else None)
+        self.itemSelectionChanged.connect(self.marked)
         self.itemChanged.connect(self._rename)
 
     @property
@@ -39,22 +46,29 @@ class RunsTable(QTableWidget):
         """The current run."""
         return self._run_of(self.currentRow())
 
-    def add(self, run: KeptRun) -> None:
-        """Show a run in the first row, and select it."""
+    @property
+    def selected(self) -> list[KeptRun]:
+        """All runs that are selected, from top to bottom; the current one, where none is."""
+        model = self.selectionModel()
+        rows = [] if model is None else sorted(index.row() for index in model.selectedRows())
+        return [run for row in rows or [self.currentRow()] if (run := self._run_of(row)) is not None]
+
+    def add(self, run: KeptRun, row: int = 0) -> None:
+        """Show a run in a row, the first one or another, and select it."""
         with self._quiet():
-            self.insertRow(0)
+            self.insertRow(row)
             for column in range(len(_COLUMNS)):
                 item = QTableWidgetItem()
                 item.setData(Qt.ItemDataRole.UserRole, run)
                 if column > 0:
                     item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable)
-                self.setItem(0, column, item)
-            self._fill(0, run)
+                self.setItem(row, column, item)
+            self._fill(row, run)
         self.select(run)
 
     def select(self, run: KeptRun) -> None:
-        """Select a run."""
-        self.setCurrentCell(self._row_of(run), 0)
+        """Select a run alone."""
+        self.setCurrentCell(self._row_of(run), 0, QItemSelectionModel.SelectionFlag.ClearAndSelect | _WHOLE_ROWS)
 
     def take_out(self, run: KeptRun) -> None:
         """Show a run no more; says nothing of which is the current one then."""
@@ -82,14 +96,14 @@ class RunsTable(QTableWidget):
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
         header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
         header.setSortIndicator(-1, Qt.SortOrder.AscendingOrder)
-        line = self.fontMetrics().height() + _ABOVE_AND_BELOW
         rows.setVisible(False)
-        rows.setDefaultSectionSize(line)
+        rows.setDefaultSectionSize(_ICON + 2)
+        self.setIconSize(QSize(_ICON, _ICON))
         self.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
-        self.setSelectionMode(QTableWidget.SelectionMode.SingleSelection)
+        self.setSelectionMode(QTableWidget.SelectionMode.ExtendedSelection)
         self.setSortingEnabled(True)
         self.setShowGrid(False)
-        self.setFixedHeight((_LINES_OF_RUNS + 1) * line + _ABOVE_AND_BELOW)
+        self.setFixedHeight(_LINES_OF_RUNS * (_ICON + 2) + self.fontMetrics().height() + 2 * _ABOVE_AND_BELOW)
 
     def _run_of(self, row: int) -> KeptRun | None:
         item = self.item(row, 0)
@@ -114,6 +128,9 @@ class RunsTable(QTableWidget):
             if item is not None:
                 # As numbers, which are sorted as such.
                 item.setData(Qt.ItemDataRole.DisplayRole, value)
+        first = self.item(row, 0)
+        if first is not None and first.icon().isNull() and run.result is not None:
+            first.setIcon(icon_of(run.result.image, _ICON))
 
     def _rename(self, item: QTableWidgetItem) -> None:
         self.renamed.emit(item.data(Qt.ItemDataRole.UserRole), item.text().strip())
