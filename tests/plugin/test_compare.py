@@ -255,7 +255,8 @@ def test_what_cannot_be_compared_says_why(grey, kept_run, grey_result, colour_re
 
 @pytest.mark.parametrize("way", ["flicker", "side by side"])
 @pytest.mark.parametrize(
-    "deed", ["select", "remove", "remove other", "rename", "add", "delete image", "delete shown", "delete all"]
+    "deed",
+    ["select", "remove", "remove other", "rename", "add", "switch", "delete image", "delete shown", "delete all"],
 )
 def test_whatever_happens_ends_it_without_a_trace(grey, kept_run, qtbot, way, deed):
     viewer, panel, runs = grey
@@ -277,6 +278,9 @@ def test_whatever_happens_ends_it_without_a_trace(grey, kept_run, qtbot, way, de
         case "add":
             panel.add(kept_run(viewer, [viewer.layers["burst"]], "TYX", runs[0].result, "run 3"))
             left = [*left, "run 3: image"]
+        case "switch":
+            runs[1].layers.switch("path", True)
+            left = [*left, "run 2: path"]
         case "delete image":
             viewer.layers.remove("run 1: image")
             left = ["run 2: image"]

@@ -117,12 +117,12 @@ def test_a_removed_run_comes_back_as_it_was(viewer, panel, runs):
     layer.contrast_limits, layer.gamma, layer.visible, layer.name = (10, 20), 0.5, False, "mine"
     runs[1].layers.switch("path", True)
     before = names(viewer)
-    assert panel.undo_button.isHidden()
+    assert not panel.undo_button.isVisibleTo(panel)
     panel.select(runs[1])
     panel.remove_button.click()
     assert names(viewer) == ["burst", "run 1: image", "run 3: image"]
     assert panel.runs == (runs[0], runs[2])
-    assert not panel.undo_button.isHidden()
+    assert panel.undo_button.isVisibleTo(panel)
     panel.undo_button.click()
     assert names(viewer) == before
     assert viewer.layers["mine"] is layer
@@ -130,7 +130,7 @@ def test_a_removed_run_comes_back_as_it_was(viewer, panel, runs):
     assert panel.runs == tuple(runs)
     assert [panel.table.item(row, 0).text() for row in range(3)] == ["run 3", "run 2", "run 1"]
     assert panel.run is runs[1]
-    assert panel.undo_button.isHidden()
+    assert not panel.undo_button.isVisibleTo(panel)
     # It is a run like any other again.
     assert runs[1].layers.is_on("path")
     runs[1].layers.switch("path", False)
@@ -184,7 +184,7 @@ def test_only_the_last_removal_can_be_undone_and_none_once_a_run_starts(
     panel.add(kept_run(viewer, [burst], "TYX", grey_result, "run 4"))
     gc.collect()
     assert gone() is None
-    assert panel.undo_button.isHidden()
+    assert not panel.undo_button.isVisibleTo(panel)
     assert names(viewer) == ["burst", "run 3: image", "run 4: image"]
 
 

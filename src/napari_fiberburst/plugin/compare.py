@@ -35,7 +35,7 @@ class CompareBox(QWidget):
     """Compares the run that is selected, A, with another, or with the burst as recorded, B.
 
     While it does, temporary layers stand in the viewer in place of all others. They go, and what was shown before comes
-    back, when the button is released, and whenever something happens to the runs or a layer is deleted.
+    back, when the button is released, and whenever something happens to the runs, or a layer comes or goes.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class CompareBox(QWidget):
 
     def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
         super().__init__(parent)
-        # While all layers are deleted is no time to delete one more.
+        # While layers are added or deleted is no time to delete one more.
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
         self._soon.timeout.connect(self.stop)
@@ -129,6 +129,7 @@ class CompareBox(QWidget):
     def _flicker(self, a: Side, b: Side) -> None:
         self._show_both(a, b)
         self.flip.setVisible(True)
+        self.flip.setFocus()  # for the space bar
         with _quiet(self.flip):
             self.flip.setChecked(False)
         self._show_a_or_b(False)
@@ -213,6 +214,7 @@ class CompareBox(QWidget):
             combo.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
             combo.setMinimumContentsLength(_LETTERS)
         self.words.setWordWrap(True)
+        self.words.setTextFormat(Qt.TextFormat.PlainText)  # with names that users have given
         row = row_of(self.button, self.way, self.other)
         row.setStretch(2, 1)
         column = QVBoxLayout(self)

@@ -1,7 +1,7 @@
 """The runs that are kept, and what can be done with them."""
 
 from napari.components import ViewerModel
-from qtpy.QtCore import Signal
+from qtpy.QtCore import Qt, Signal
 from qtpy.QtWidgets import QLabel, QPushButton, QSpinBox, QVBoxLayout, QWidget
 
 from napari_fiberburst.plugin.compare import CompareBox
@@ -38,7 +38,7 @@ class RunsPanel(QWidget):
         self.compare = CompareBox(viewer)
         self.remove_button = QPushButton("Remove")
         self.remove_button.setToolTip("Forget the selected runs and take their layers out of the viewer.")
-        self.undo_button, self._what_was_removed = QPushButton("Undo remove"), QLabel()
+        self._undo, self.undo_button, self._what_was_removed = QWidget(), QPushButton("Undo remove"), QLabel()
         self.undo_button.setToolTip("Bring back what was removed last, with its layers; until the next run starts.")
         self.continue_button = QPushButton("Continue for")
         self._more_steps = QSpinBox()
@@ -118,13 +118,18 @@ class RunsPanel(QWidget):
         self._more_steps.setRange(1, 10**6)
         self._more_steps.setValue(_MORE_STEPS)
         self._more_steps.setSuffix(" more steps")
+        self._more_steps.setAccessibleName("steps to go on for")
+        self._more_steps.setToolTip("How many steps a network is taken further.")
         layout = QVBoxLayout(self)
         layout.setContentsMargins(0, 0, 0, 0)
         layout.addWidget(self.table)
         self._what_was_removed.setWordWrap(True)
+        self._what_was_removed.setTextFormat(Qt.TextFormat.PlainText)  # with names that users have given
         undo = row_of(self._what_was_removed, self.undo_button)
         undo.setStretch(0, 1)
-        layout.addLayout(undo)
+        undo.setContentsMargins(0, 0, 0, 0)
+        self._undo.setLayout(undo)
+        layout.addWidget(self._undo)
         layout.addWidget(self.compare)
         layout.addLayout(row_of(self.continue_button, self._more_steps, self.remove_button))
         layout.addWidget(self.save)
@@ -163,8 +168,7 @@ class RunsPanel(QWidget):
     def _tell_what_was_removed(self) -> None:
         names = [run.name for _, run in self._removed]
         self._what_was_removed.setText(f"removed: {', '.join(names)}")
-        for widget in (self._what_was_removed, self.undo_button):
-            widget.setVisible(bool(names))
+        self._undo.setVisible(bool(names))
 
     def _let_go(self) -> None:
         """Let go of what was removed: it cannot be brought back any more."""

@@ -21,12 +21,12 @@ class Stage:
     ----------
     viewer : ViewerModel
         Whose layers.
-    when_deleted : callable
-        Called when somebody else takes a layer out of the viewer meanwhile.
+    when_disturbed : callable
+        Called when somebody else adds a layer meanwhile, or takes one away.
     """
 
-    def __init__(self, viewer: ViewerModel, when_deleted: Callable[[], None]) -> None:
-        self._viewer, self._when_deleted = viewer, when_deleted
+    def __init__(self, viewer: ViewerModel, when_disturbed: Callable[[], None]) -> None:
+        self._viewer, self._when_disturbed = viewer, when_disturbed
         self._before: dict[Layer, bool] | None = None
         self._grid: dict[str, object] = {}
         self._shown: list[Layer] = []
@@ -41,7 +41,8 @@ class Stage:
         self._before = {layer: layer.visible for layer in self._viewer.layers}
         for layer in self._viewer.layers:
             layer.visible = False
-        self._viewer.layers.events.removed.connect(self._take_deletion)
+        for event in self._events:
+            event.connect(self._take_change)
 
     def show(self, layer: Layer, name: str) -> Layer:
         """Add a temporary layer, on top; what the user works on stays selected."""
@@ -88,7 +89,7 @@ class Stage:
         shown, self._shown = self._shown, []
         if before is None:
             return
-        self._viewer.layers.events.removed.disconnect(self._take_deletion)
+        self.abandon()
         for layer in shown:
             if layer in self._viewer.layers:
                 self._viewer.layers.remove(layer)
@@ -101,10 +102,16 @@ class Stage:
 
     def abandon(self) -> None:
         """Leave the viewer as it is, because its window is gone."""
-        self._viewer.layers.events.removed.disconnect(self._take_deletion)
+        for event in self._events:
+            event.disconnect(self._take_change)
 
-    def _take_deletion(self, event: Any) -> None:
-        self._when_deleted()
+    @property
+    def _events(self) -> tuple[Any, Any]:
+        return self._viewer.layers.events.inserted, self._viewer.layers.events.removed
+
+    def _take_change(self, event: Any) -> None:
+        if event.type == "removed" or event.value not in self._shown:
+            self._when_disturbed()
 
     def _set_grid(self, values: Mapping[str, object]) -> None:
         for name, value in values.items():
