@@ -60,16 +60,16 @@ def in_plugin(viewer: Any, dock: FiberBurstWidget) -> dict[str, Any]:
     rates: list[float] = []
     complete: list[Any] = []
     seen = viewer.layers.events.inserted.connect(lambda _: first.append(time.perf_counter() - began))
-    reported = dock.runner.reported.connect(lambda report: rates.append(report.rate))
-    ended = dock.display.complete.connect(complete.append)
+    reported = dock.picture.runner.reported.connect(lambda report: rates.append(report.rate))
+    ended = dock.picture.display.complete.connect(complete.append)
     beat = Heartbeat()
-    dock.start()
-    wait_until(lambda: dock.runner.state == "ready")
+    dock.picture.start()
+    wait_until(lambda: dock.picture.runner.state == "ready")
     gaps = beat.stop()
     wait_until(lambda: bool(complete))
     viewer.layers.events.inserted.disconnect(seen)
-    dock.runner.reported.disconnect(reported)
-    dock.display.complete.disconnect(ended)
+    dock.picture.runner.reported.disconnect(reported)
+    dock.picture.display.complete.disconnect(ended)
     return {"first": first[0], "rate": rates[-1], "gaps": gaps}
 
 
@@ -84,7 +84,7 @@ def measure_speed() -> None:
     """Print plugin and script side by side, the first round cold; in a window that is drawn."""
     for name, choices in FITS.items():
         viewer, dock, frames = open_window(is_drawn=os.environ.get("QT_QPA_PLATFORM") != "offscreen")
-        dock.form.set_choices(choices)
+        dock.picture.form.set_choices(choices)
         for number in range(ROUNDS):
             found = in_plugin(viewer, dock)
             script = in_script(frames, choices, 0.25)
@@ -115,9 +115,9 @@ def measure_leaks() -> None:
         remove_runs(dock)
     print(f"{ROUNDS} runs, each removed: memory {before:.0f} -> {resident():.0f} MiB")
     for _ in range(CYCLES):
-        dock.start()
-        dock.runner.stop()
-        wait_until(lambda: dock.runner.state == "ready")
+        dock.picture.start()
+        dock.picture.runner.stop()
+        wait_until(lambda: dock.picture.runner.state == "ready")
         remove_runs(dock)
     after = resident()
     print(
@@ -129,8 +129,8 @@ def measure_leaks() -> None:
 
 def remove_runs(dock: FiberBurstWidget) -> None:
     """Forget all runs and their layers."""
-    for run in dock.runs.runs:
-        dock.runs.remove(run)
+    for run in dock.picture.runs.runs:
+        dock.picture.runs.remove(run)
 
 
 def open_window(*, is_drawn: bool) -> tuple[Any, FiberBurstWidget, Any]:
@@ -141,7 +141,7 @@ def open_window(*, is_drawn: bool) -> tuple[Any, FiberBurstWidget, Any]:
     viewer.add_image(frames, **look)
     dock = FiberBurstWidget(viewer)
     viewer.window.add_dock_widget(dock, name="fiber burst")
-    dock.form.set_choices({})
+    dock.picture.form.set_choices({})
     return viewer, dock, frames
 
 

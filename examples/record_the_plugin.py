@@ -45,9 +45,9 @@ def main(path: str) -> None:
     pause(3000)  # the window is laid out, and torch loads
     viewer.reset_view()
     take()
-    dock.runner.previewed.connect(lambda _: QTimer.singleShot(150, take))
-    dock.start()
-    wait(dock.display.complete)
+    dock.picture.runner.previewed.connect(lambda _: QTimer.singleShot(150, take))
+    dock.picture.start()
+    wait(dock.picture.display.complete)
     pause(500)
     take()
     durations = [MILLISECONDS_A_FRAME] * (len(frames) - 1) + [MILLISECONDS_AT_END]

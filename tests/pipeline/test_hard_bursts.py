@@ -75,7 +75,9 @@ def test_a_frame_that_shows_nothing_is_left_out_and_named(cores, fitted, spoil, 
         result = reconstruct(recorded(cores, spoil), fill=True)
     assert result.frames_used == tuple(number for number in range(12) if number != 4)
     assert np.isnan(result.homographies[4]).all()
-    assert result.confidence[4] < 0.6 * np.median(result.confidence)
+    # How far it agrees with the others is low, or cannot be asked because it is blank.
+    assert not result.confidence[4] > 0.6 * np.nanmedian(result.confidence)
+    assert np.isnan(result.confidence[4]) == (spoil is not spoil_noise)
     assert any("left out: 4" in note for note in result.notes)
     assert "left out: 4" in caplog.text
     assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.0

@@ -98,12 +98,15 @@ FIT = GoodnessOfFit(
     structure=0.04,
     still=0.7,
     smear=0.0,
+    falloff=1.1,
     is_noise_known=True,
 )
 
 
-def verdict(frames=16, **change):
+def verdict(frames=16, used=None, confidence=None, **change):
     registration = replace(Registration.known(np.tile(np.eye(3), (frames, 1, 1)), SHAPE, 300), travel=9.0)
+    if used is not None:
+        registration = replace(registration, used=used, confidence=confidence)
     return judge(replace(FIT, **change), registration, 4.7, gains_known=False)
 
 
@@ -119,6 +122,7 @@ def test_each_sign_of_a_fault_is_a_reason_of_its_own():
         {"structure": 0.4, "error": 0.15, "disagreement": 0.2},
         {"structure": -0.1},
         {"smear": 4.0, "structure": -0.1},
+        {"falloff": 2.0},
         {"frame_misfit": uneven, "error": 0.15, "disagreement": 0.2},
         {"core_misfit": spoilt, "error": 0.15, "disagreement": 0.2},
     ]
@@ -132,6 +136,16 @@ def test_few_frames_may_miss_more_of_what_is_left_out():
     assert verdict(frames=6, error=0.3, **apart).quality == "good"
     assert verdict(frames=16, error=0.3, **apart).quality == "doubtful"
     assert verdict(frames=16, error=0.8, **apart).quality == "bad"
+
+
+def test_frames_that_differ_from_the_rest_cast_doubt_on_it_and_blank_ones_do_not():
+    used, agreement = np.ones(16, bool), np.ones(16)
+    used[:5], agreement[:5] = False, 0.1
+    assert verdict(used=used, confidence=agreement).reasons == (
+        "only 11 of the 16 frames that show anything could be registered",
+    )
+    agreement[:5] = np.nan
+    assert verdict(used=used, confidence=agreement).quality == "good"
 
 
 def test_single_cores_that_are_missed_do_not_spoil_an_image_whose_halves_agree():

@@ -71,9 +71,9 @@ def run_through(qtbot) -> Callable[[FiberBurstWidget], Any]:
     """Return a function that starts the dock, waits for the last layer, and returns the run."""
 
     def ran(dock: FiberBurstWidget) -> Any:
-        with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-            dock.start()
-        return dock.runs.run
+        with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+            dock.picture.start()
+        return dock.picture.runs.run
 
     return ran
 

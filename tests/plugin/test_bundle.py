@@ -90,7 +90,7 @@ def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
     second = run_through(dock)
     assert second.result.image.shape == (63, 75, 3)
     np.testing.assert_allclose(second.result.bundle.centres, first.result.bundle.centres, atol=0.1)
-    switches = dock.display.card.switches
+    switches = dock.picture.display.card.switches
     offered = [kind for kind, box in switches.items() if not box.isHidden()]
     assert offered == ["coverage", "frames", "uncertainty", "transmission", "residuals"]
     switches["residuals"].setChecked(True)
@@ -110,9 +110,9 @@ def test_one_frame_resolves_as_in_a_script(open_dock, run_through, frame_layer, 
 
 def test_one_frame_without_a_bundle_says_what_to_do(open_dock, frame_layer):
     _, dock = open_dock(frame_layer)
-    (notice,) = notices_during(dock.start)
+    (notice,) = notices_during(dock.picture.start)
     assert "choose or open its bundle" in notice
-    assert dock.runner.state == "ready"
+    assert dock.picture.runner.state == "ready"
 
 
 def test_a_bundle_that_was_given_is_kept_improved(open_dock, run_through, burst_layer, bundle, bundle_file, tmp_path):
@@ -140,12 +140,14 @@ def test_an_image_in_even_light_is_kept_as_a_bundle_improved(open_dock, run_thro
 
 def test_only_a_run_with_a_resolved_bundle_offers_to_keep_it(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
-    assert not dock.runs.save.bundle.isEnabled()
+    assert not dock.picture.runs.save.bundle.isEnabled()
     run_through(dock)
-    assert dock.runs.save.bundle.isEnabled()
-    dock.form.set_choices({"preset": "paper", "iterations": 2, "scene_width": 16, "scene_layers": 1, "features": 16})
+    assert dock.picture.runs.save.bundle.isEnabled()
+    dock.picture.form.set_choices(
+        {"preset": "paper", "iterations": 2, "scene_width": 16, "scene_layers": 1, "features": 16}
+    )
     published = run_through(dock)
-    assert not dock.runs.save.bundle.isEnabled()
+    assert not dock.picture.runs.save.bundle.isEnabled()
     with pytest.raises(BundleError, match="has found no bundle"):
         published.bundle_to_keep()
 
@@ -178,12 +180,12 @@ def test_a_bundle_that_does_not_fit_leaves_the_dock_usable(open_dock, qtbot, bur
     viewer, dock = open_dock(burst_layer)
     dock.input.open_bundle(path)
     before = len(notification_manager.records)
-    with qtbot.waitSignal(dock.runner.ready, timeout=MILLISECONDS):
-        dock.start()
+    with qtbot.waitSignal(dock.picture.runner.ready, timeout=MILLISECONDS):
+        dock.picture.start()
     (notice,) = [record.message for record in list(notification_manager.records)[before:]]
     assert "measured in frames of 50 x 61 pixels, and the burst has 63 x 75" in notice
-    assert dock.start_button.isEnabled()
-    assert not dock.runs.runs
+    assert dock.picture.start_button.isEnabled()
+    assert not dock.picture.runs.runs
     assert [layer.name for layer in viewer.layers] == ["burst", "small", "small cores"]
 
 
@@ -229,7 +231,7 @@ def test_the_keep_button_asks_where_to(open_dock, run_through, monkeypatch, burs
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
     monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
-    dock.runs.save.bundle.click()
+    dock.picture.runs.save.bundle.click()
     assert suggested == ["burst.bundle"]
     np.testing.assert_array_equal(Bundle.load(tmp_path / "kept.bundle").centres, run.result.bundle.centres)
 
@@ -239,11 +241,11 @@ def test_copied_calls_name_the_bundles_file(open_dock, frame_layer, bundle_file)
 
     viewer, dock = open_dock(frame_layer)
     dock.input.open_bundle(bundle_file)
-    dock.copying.command.click()
+    dock.picture.copying.command.click()
     assert QApplication.clipboard().text().splitlines()[-1] == (
         f"fiberburst reconstruct burst.tif -o image.ome.tif --bundle {bundle_file}"
     )
-    dock.copying.python.click()
+    dock.picture.copying.python.click()
     scope = {"viewer": viewer}
     exec(QApplication.clipboard().text().replace('result.save("image.ome.tif")\n', ""), scope)
     assert scope["result"].image.shape == (63, 75, 3)

@@ -315,8 +315,8 @@ def test_contrast_that_was_set_by_hand_is_kept(grey):
 def test_nobody_takes_a_temporary_layer_for_a_burst_and_it_goes_with_the_dock(open_dock, kept_run, grey_frames, fit):
     viewer, dock = open_dock(Image(grey_frames, name="burst"))
     run = kept_run(viewer, [viewer.layers["burst"]], "TYX", fit(grey_frames, iterations=1))
-    dock.runs.add(run)
-    press(viewer, dock.runs, "difference", "as recorded")
+    dock.picture.runs.add(run)
+    press(viewer, dock.picture.runs, "difference", "as recorded")
     dock.reset_choices()
     assert [layer.name for layer in dock.input.burst.choices] == ["burst"]
     viewer.window.remove_dock_widget(dock.parent())

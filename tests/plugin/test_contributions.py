@@ -118,7 +118,7 @@ def test_a_result_layer_is_written_with_its_provenance(open_dock, run_through, b
     assert tifffile.imread(written[0]).shape == (3, 63, 75)
     assert json.loads((tmp_path / "out.json").read_text())["ending"] == "finished"
     # napari gives the writer other images too.
-    dock.display.card.switches["coverage"].setChecked(True)
+    dock.picture.display.card.switches["coverage"].setChecked(True)
     viewer.layers["run 1: coverage"].save(str(tmp_path / "coverage.ome.tif"))
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "coverage.ome.tif"), viewer.layers["run 1: coverage"].data)
     contributions.write(str(tmp_path / "b.ome.tif"), *burst_layer.as_layer_data_tuple()[:2])
@@ -131,10 +131,10 @@ def test_the_layers_menu_registers_and_reconstructs(make_napari_viewer, qtbot, b
     viewer.add_layer(burst_layer)
     contributions.register_layer()
     (dock,) = viewer.window.dock_widgets.values()
-    with qtbot.waitSignal(dock.display.complete, timeout=60_000):
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=60_000):
         pass
     assert viewer.layers["run 1: stabilised burst"].visible
-    assert dock.display.card.switches["stabilised burst"].isChecked()
+    assert dock.picture.display.card.switches["stabilised burst"].isChecked()
     assert not viewer.layers["run 1: image"].visible
 
 

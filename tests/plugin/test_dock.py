@@ -10,10 +10,10 @@ from qtpy.QtCore import Qt
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.pipeline import reconstruct as pipeline
-from napari_fiberburst.plugin import dock as dock_module
 from napari_fiberburst.plugin.dock import FiberBurstWidget
 from napari_fiberburst.plugin.preferences import Preferences
 from napari_fiberburst.plugin.stacks import stabilised
+from napari_fiberburst.plugin.tasks import picture as picture_task
 from napari_fiberburst.simulation import Camera, Faults, simulate
 
 MILLISECONDS = 60_000
@@ -32,8 +32,8 @@ def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated
     np.testing.assert_array_equal(shown[..., 3], known)
     assert run.scores.motion_error < 0.5
     assert run.scores.psnr > 20
-    assert dock.start_button.isEnabled()
-    assert not dock.stop_button.isEnabled()
+    assert dock.picture.start_button.isEnabled()
+    assert not dock.picture.stop_button.isEnabled()
 
 
 def test_the_plugin_runs_the_same_reconstruction_as_a_script(open_dock, run_through, burst_layer, simulated):
@@ -62,7 +62,7 @@ def test_the_signals_of_a_finished_run_come_in_order(open_dock, run_through, bur
     _, dock = open_dock(burst_layer)
     seen = []
     for name in ("started", "reported", "previewed", "finished", "stopped", "failed", "ready"):
-        getattr(dock.runner, name).connect(lambda *_, name=name: seen.append(name))
+        getattr(dock.picture.runner, name).connect(lambda *_, name=name: seen.append(name))
     run_through(dock)
     assert seen[0] == "started"
     assert seen[-2:] == ["finished", "ready"]
@@ -71,130 +71,132 @@ def test_the_signals_of_a_finished_run_come_in_order(open_dock, run_through, bur
 
 def test_a_stopped_run_keeps_what_it_has(open_dock, qtbot, burst_layer):
     _, dock = open_dock(burst_layer)
-    dock.form.set_choices({**NETWORK, "iterations": 100_000})
+    dock.picture.form.set_choices({**NETWORK, "iterations": 100_000})
     seen = []
     for name in ("finished", "stopped", "failed", "ready"):
-        getattr(dock.runner, name).connect(lambda *_, name=name: seen.append(name))
-    with qtbot.waitSignal(dock.runner.previewed, timeout=MILLISECONDS):
-        dock.start()
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.stop_button.click()
+        getattr(dock.picture.runner, name).connect(lambda *_, name=name: seen.append(name))
+    with qtbot.waitSignal(dock.picture.runner.previewed, timeout=MILLISECONDS):
+        dock.picture.start()
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.stop_button.click()
     assert seen == ["stopped", "ready"]
-    assert dock.runs.run.result.ending == "stopped"
-    assert np.isfinite(dock.runs.run.result.image).any()
+    assert dock.picture.runs.run.result.ending == "stopped"
+    assert np.isfinite(dock.picture.runs.run.result.image).any()
 
 
 def test_a_paused_run_waits_and_goes_on(open_dock, qtbot, burst_layer):
     _, dock = open_dock(burst_layer)
-    dock.form.set_choices(NETWORK)
-    with qtbot.waitSignal(dock.runner.reported, timeout=MILLISECONDS):
-        dock.start()
-    dock.pause_button.click()
-    assert dock.runner.state == "paused"
-    assert dock.pause_button.text() == "Continue"
+    dock.picture.form.set_choices(NETWORK)
+    with qtbot.waitSignal(dock.picture.runner.reported, timeout=MILLISECONDS):
+        dock.picture.start()
+    dock.picture.pause_button.click()
+    assert dock.picture.runner.state == "paused"
+    assert dock.picture.pause_button.text() == "Continue"
     qtbot.wait(300)  # the step it was in
-    points = len(dock.runner.job.curve)
+    points = len(dock.picture.runner.job.curve)
     qtbot.wait(400)
-    assert len(dock.runner.job.curve) == points
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.pause_button.click()
-    assert dock.runs.run.result.ending == "finished"
+    assert len(dock.picture.runner.job.curve) == points
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.pause_button.click()
+    assert dock.picture.runs.run.result.ending == "finished"
 
 
 def test_sigma_can_be_turned_while_running(open_dock, qtbot, burst_layer):
     _, dock = open_dock(burst_layer)
-    dock.form.set_choices({**NETWORK, "sigma": 2.0})
-    with qtbot.waitSignal(dock.runner.reported, timeout=MILLISECONDS):
-        dock.start()
-    rows = dock.form.rows
+    dock.picture.form.set_choices({**NETWORK, "sigma": 2.0})
+    with qtbot.waitSignal(dock.picture.runner.reported, timeout=MILLISECONDS):
+        dock.picture.start()
+    rows = dock.picture.form.rows
     assert rows["sigma"].isEnabled()
     assert rows["learning_rate"].isEnabled()
     assert not rows["features"].isEnabled()
     rows["sigma"].editor.value = 3.5
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
         pass
-    assert dock.runs.run.result.settings.method.encoding.sigma == 3.5
+    assert dock.picture.runs.run.result.settings.method.encoding.sigma == 3.5
 
 
 def test_a_network_goes_on_for_more_steps(open_dock, qtbot, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
-    dock.form.set_choices({"preset": "paper", **NETWORK, "iterations": 20})
+    dock.picture.form.set_choices({"preset": "paper", **NETWORK, "iterations": 20})
     first = run_through(dock)
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.continue_run(first, 15)
-    assert dock.runs.run is not first
-    assert len(dock.runs.run.result.losses) == 35
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.continue_run(first, 15)
+    assert dock.picture.runs.run is not first
+    assert len(dock.picture.runs.run.result.losses) == 35
 
 
 def test_a_spline_has_nothing_to_go_on_for(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     run_through(dock)
-    assert not dock.runs.continue_button.isEnabled()
-    assert "solved to its end" in dock.runs.continue_button.toolTip()
+    assert not dock.picture.runs.continue_button.isEnabled()
+    assert "solved to its end" in dock.picture.runs.continue_button.toolTip()
 
 
 def test_open_settings_say_what_was_chosen(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
     chosen = run.result.settings.method.smoothness
-    assert dock.form.rows["smoothness"].auto.text() == f"auto ({chosen:.3g})"
-    assert "smoothness" not in dock.form.choices()
+    assert dock.picture.form.rows["smoothness"].auto.text() == f"auto ({chosen:.3g})"
+    assert "smoothness" not in dock.picture.form.choices()
 
 
 def test_the_form_is_as_it_was_left(open_dock, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices({"motion": "affine", "upsample": 2.0})
+    dock.picture.form.set_choices({"motion": "affine", "upsample": 2.0})
     again = FiberBurstWidget(viewer)
-    assert again.form.choices() == {"motion": "affine", "upsample": 2.0}
+    assert again.picture.form.choices() == {"motion": "affine", "upsample": 2.0}
     again.shut_down()
 
 
 def test_what_is_remembered_is_told_with_one_click_back(open_dock, burst_layer, grey_frames):
     viewer, dock = open_dock(burst_layer)
-    assert dock.departures.isHidden()
-    dock.form.set_choices({"preset": "paper", "sigma": 2.0})
-    assert dock.departures.words.text() == "set: paper, sigma 2.0"
+    assert dock.picture.departures.isHidden()
+    dock.picture.form.set_choices({"preset": "paper", "sigma": 2.0})
+    assert dock.picture.departures.words.text() == "set: paper, sigma 2.0"
     again = FiberBurstWidget(viewer)
-    assert not again.departures.isHidden()
-    assert again.departures.words.text() == "as last time: paper, sigma 2.0"
-    again.departures.back_button.click()
-    assert again.form.choices() == {}
-    assert again.departures.isHidden()
+    assert not again.picture.departures.isHidden()
+    assert again.picture.departures.words.text() == "as last time: paper, sigma 2.0"
+    again.picture.departures.back_button.click()
+    assert again.picture.form.choices() == {}
+    assert again.picture.departures.isHidden()
     again.shut_down()
     # Nor is it told less where the next burst comes in the same window.
     dock.input.burst.value = viewer.add_layer(Image(grey_frames, name="next"))
-    assert dock.departures.words.text() == "as last time: paper, sigma 2.0"
+    assert dock.picture.departures.words.text() == "as last time: paper, sigma 2.0"
 
 
 def test_a_preset_that_is_preferred_needs_no_word(open_dock, burst_layer, monkeypatch):
-    monkeypatch.setattr(dock_module, "preferences", lambda: Preferences(preset="paper"))
+    monkeypatch.setattr(picture_task, "preferences", lambda: Preferences(preset="paper"))
     _, dock = open_dock(burst_layer)
-    assert dock.form.choices() == {"preset": "paper"}
-    assert dock.departures.isHidden()
-    dock.form.set_choices({"device": "cpu"})
-    assert dock.departures.words.text() == "set: auto, device cpu"
+    assert dock.picture.form.choices() == {"preset": "paper"}
+    assert dock.picture.departures.isHidden()
+    dock.picture.form.set_choices({"device": "cpu"})
+    assert dock.picture.departures.words.text() == "set: auto, device cpu"
 
 
 def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     first = run_through(dock)
-    dock.form.set_choices({**QUICK, "iterations": 4})
+    dock.picture.form.set_choices({**QUICK, "iterations": 4})
     second = run_through(dock)
 
     def drawn():
         (plot,) = [
-            plot for plot in dock.display.curve_box.findChildren(PlotWidget) if plot.getAxis("left").labelText == "loss"
+            plot
+            for plot in dock.picture.display.curve_box.findChildren(PlotWidget)
+            if plot.getAxis("left").labelText == "loss"
         ]
         return plot.listDataItems()[0].getOriginalDataset()[0] if plot.listDataItems() else []
 
-    dock.display.curve_box.expand(animate=False)
+    dock.picture.display.curve_box.expand(animate=False)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])
-    dock.runs.select(first)
+    dock.picture.runs.select(first)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in first.curve if np.isfinite(point.loss)])
     assert len(drawn()) > 0
-    dock.runs.remove(first)
-    dock.runs.remove(second)
+    dock.picture.runs.remove(first)
+    dock.picture.runs.remove(second)
     assert len(drawn()) == 0
 
 
@@ -203,10 +205,10 @@ def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_lay
     run = run_through(dock)
     assert len(run.history.entries) >= 2
     final = viewer.layers["run 1: image"].data.copy()
-    dock.display.slider.setValue(0)
+    dock.picture.display.slider.setValue(0)
     early = viewer.layers["run 1: image"].data
     assert not np.array_equal(early, final)
-    dock.display.slider.setValue(dock.display.slider.maximum())
+    dock.picture.display.slider.setValue(dock.picture.display.slider.maximum())
     np.testing.assert_array_equal(viewer.layers["run 1: image"].data, final)
 
 
@@ -214,8 +216,8 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     from qtpy.QtWidgets import QApplication
 
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices({"motion": "affine", "upsample": 2.0})
-    dock.copying.python.click()
+    dock.picture.form.set_choices({"motion": "affine", "upsample": 2.0})
+    dock.picture.copying.python.click()
     text = QApplication.clipboard().text()
     run = run_through(dock)
     assert viewer.layers["run 1: image"].metadata["fiberburst"]["python"] == text
@@ -223,7 +225,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     scope = {"viewer": viewer}
     exec(text, scope)
     np.testing.assert_allclose(scope["result"].image, run.result.image, rtol=1e-4)
-    dock.copying.command.click()
+    dock.picture.copying.command.click()
     command = QApplication.clipboard().text()
     assert command.splitlines()[-1] == (
         "fiberburst reconstruct simulated.burst -o image.ome.tif --motion affine --upsample 2.0"
@@ -235,38 +237,38 @@ def test_a_continued_run_keeps_its_calibration_image(open_dock, qtbot, run_throu
     _, dock = open_dock(burst_layer, even)
     dock.input.burst.value = burst_layer
     dock.input.bundle.value = even
-    dock.form.set_choices({**NETWORK, "iterations": 5})
+    dock.picture.form.set_choices({**NETWORK, "iterations": 5})
     first = run_through(dock)
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.continue_run(first, 5)
-    python = dock.runs.run.python
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.continue_run(first, 5)
+    python = dock.picture.runs.run.python
     assert python.count("calibration=viewer.layers['even'].data") == 2
     assert python.count("initial=result") == 1
 
 
 def test_a_renamed_run_renames_its_layers(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     run_through(dock)
-    dock.runs.table.item(0, 0).setText("sharp")
+    dock.picture.runs.table.item(0, 0).setText("sharp")
     assert "sharp: image" in viewer.layers
     assert viewer.layers["sharp: image"].metadata["fiberburst"]["run"] == "sharp"
-    dock.runs.table.item(0, 0).setText(" ")
-    assert dock.runs.table.item(0, 0).text() == "sharp"
+    dock.picture.runs.table.item(0, 0).setText(" ")
+    assert dock.picture.runs.table.item(0, 0).text() == "sharp"
 
 
 def switch(dock, *kinds, on=True):
     for kind in kinds:
-        dock.display.card.switches[kind].setChecked(on)
+        dock.picture.display.card.switches[kind].setChecked(on)
 
 
 def offered(dock):
-    return [kind for kind, box in dock.display.card.switches.items() if not box.isHidden()]
+    return [kind for kind, box in dock.picture.display.card.switches.items() if not box.isHidden()]
 
 
 def test_each_switch_makes_its_layer_and_takes_it_away(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    assert dock.display.card.isHidden()
+    assert dock.picture.display.card.isHidden()
     run = run_through(dock)
     assert offered(dock) == [
         "outlines",
@@ -294,14 +296,14 @@ def test_each_switch_makes_its_layer_and_takes_it_away(open_dock, run_through, b
 def test_the_card_says_what_came_of_the_run(open_dock, run_through, grey_frames):
     _, dock = open_dock(Image(grey_frames, scale=(1, 0.5, 0.5), units=("s", "um", "um")))
     result = run_through(dock).result
-    words = dock.display.card.words.text()
+    words = dock.picture.display.card.words.text()
     assert f"{result.quality}</b>" in words
     assert f"finest detail {result.resolution:.1f} px = {result.resolution / 2:.3g} µm" in words
     assert f"{len(result.frames_used)} of 8 frames" in words
     assert f"{100 * (result.coverage == 0).mean():.1f}% filled in" in words
     assert f"finished in {result.seconds:.1f} s" in words
     for note in result.notes:
-        assert escape(note) in dock.display.card.notes.text()
+        assert escape(note) in dock.picture.display.card.notes.text()
 
 
 def test_a_layer_that_a_user_deletes_is_switched_off(open_dock, run_through, burst_layer):
@@ -309,21 +311,21 @@ def test_a_layer_that_a_user_deletes_is_switched_off(open_dock, run_through, bur
     run_through(dock)
     switch(dock, "coverage")
     viewer.layers.remove("run 1: coverage")
-    assert not dock.display.card.switches["coverage"].isChecked()
+    assert not dock.picture.display.card.switches["coverage"].isChecked()
     switch(dock, "coverage")
     assert "run 1: coverage" in viewer.layers
 
 
 def test_outlines_can_be_seen_while_a_run_goes_and_follow_it(open_dock, qtbot, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices({**NETWORK, "iterations": 100_000})
-    with qtbot.waitSignal(dock.runner.previewed, timeout=MILLISECONDS):
-        dock.start()
+    dock.picture.form.set_choices({**NETWORK, "iterations": 100_000})
+    with qtbot.waitSignal(dock.picture.runner.previewed, timeout=MILLISECONDS):
+        dock.picture.start()
     qtbot.waitUntil(lambda: offered(dock) == ["outlines", "path"], timeout=MILLISECONDS)
     switch(dock, "outlines", "path")
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.stop_button.click()
-    homographies = dock.runs.run.result.homographies
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.stop_button.click()
+    homographies = dock.picture.runs.run.result.homographies
     corner = homographies[3] @ [-0.5, -0.5, 1]
     (outline,) = [shape for shape in viewer.layers["run 1: outlines"].data if shape[0, 0] == 3]
     np.testing.assert_allclose(outline[0, 1:], (corner[:2] / corner[2])[::-1], atol=1e-6)
@@ -332,7 +334,7 @@ def test_outlines_can_be_seen_while_a_run_goes_and_follow_it(open_dock, qtbot, b
 
 def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     run_through(dock)
     switch(dock, "outlines", "path")
     run_through(dock)
@@ -341,31 +343,31 @@ def test_only_the_newest_run_outlines_its_frames(open_dock, run_through, burst_l
 
 def test_the_list_of_runs_shows_the_newest_first(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     for _ in range(3):
         run_through(dock)
-    table = dock.runs.table
-    first, second, third = dock.runs.runs
+    table = dock.picture.runs.table
+    first, second, third = dock.picture.runs.runs
 
     def listed():
         return [table.item(row, 0).text() for row in range(table.rowCount())]
 
     assert listed() == ["run 3", "run 2", "run 1"]
-    assert dock.runs.run is third
-    dock.runs.select(first)
+    assert dock.picture.runs.run is third
+    dock.picture.runs.select(first)
     switch(dock, "path")
     assert "run 1: path" in viewer.layers
-    dock.runs.select(third)
-    assert not dock.display.card.switches["path"].isChecked()
+    dock.picture.runs.select(third)
+    assert not dock.picture.display.card.switches["path"].isChecked()
     # Sorted by what a heading says, rows are still those of their runs.
     seconds = {run.name: run.result.seconds for run in (first, second, third)}
     table.sortByColumn(2, Qt.SortOrder.AscendingOrder)
     assert [round(seconds[name], 1) for name in listed()] == sorted(round(value, 1) for value in seconds.values())
-    assert dock.runs.run is third
+    assert dock.picture.runs.run is third
     table.sortByColumn(0, Qt.SortOrder.AscendingOrder)
     assert listed() == ["run 1", "run 2", "run 3"]
-    dock.runs.select(second)
-    dock.runs.remove_button.click()
+    dock.picture.runs.select(second)
+    dock.picture.runs.remove_button.click()
     assert listed() == ["run 1", "run 3"]
     assert "run 2: image" not in viewer.layers
 
@@ -373,7 +375,7 @@ def test_the_list_of_runs_shows_the_newest_first(open_dock, run_through, burst_l
 def test_a_row_tells_what_came_of_its_run(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
     result = run_through(dock).result
-    cells = [dock.runs.table.item(0, column).text() for column in range(5)]
+    cells = [dock.picture.runs.table.item(0, column).text() for column in range(5)]
     assert cells[:2] == ["run 1", "spline"]
     assert float(cells[2]) == round(result.seconds, 1)
     assert cells[3] == result.quality
@@ -412,4 +414,4 @@ def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_throu
     alike = [np.corrcoef(gaussian_filter(moved, 4)[inner].ravel(), truth.ravel())[0, 1] for moved in (still, plain)]
     assert alike[0] > alike[1]
     assert result.outliers.any() == ("left out" in offered(dock))
-    assert f">{result.quality}</b>" in dock.display.card.words.text()
+    assert f">{result.quality}</b>" in dock.picture.display.card.words.text()

@@ -13,8 +13,8 @@ MILLISECONDS = 60_000
 
 def is_empty(dock):
     """Whether the dock offers to open a burst, and nothing else."""
-    assert dock.empty.isHidden() != dock._filled.isHidden()
-    return dock._filled.isHidden()
+    assert dock.empty.isHidden() != dock.filled.isHidden()
+    return dock.filled.isHidden()
 
 
 def test_the_form_is_there_while_there_is_a_burst(open_dock, burst_layer):
@@ -31,7 +31,7 @@ def test_runs_stay_in_sight_when_their_burst_is_gone(open_dock, run_through, bur
     run = run_through(dock)
     viewer.layers.clear()
     assert not is_empty(dock)
-    dock.runs.remove(run)
+    dock.picture.runs.remove(run)
     assert is_empty(dock)
 
 

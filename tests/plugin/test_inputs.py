@@ -23,7 +23,7 @@ def notices_during(act):
 def switch_on(dock, *kinds):
     """Show these on the result card."""
     for kind in kinds:
-        dock.display.card.switches[kind].setChecked(True)
+        dock.picture.display.card.switches[kind].setChecked(True)
 
 
 @pytest.mark.parametrize(
@@ -36,9 +36,9 @@ def switch_on(dock, *kinds):
 )
 def test_what_is_no_burst_is_refused_at_once(open_dock, layers, words):
     _, dock = open_dock(*layers)
-    (notice,) = notices_during(dock.start)
+    (notice,) = notices_during(dock.picture.start)
     assert words in notice
-    assert dock.runner.state == "ready"
+    assert dock.picture.runner.state == "ready"
 
 
 def test_a_burst_with_nan_is_refused_in_one_notification(open_dock, qtbot, grey_frames):
@@ -46,12 +46,12 @@ def test_a_burst_with_nan_is_refused_in_one_notification(open_dock, qtbot, grey_
     frames[2, 5, 5] = np.nan
     viewer, dock = open_dock(Image(frames))
     before = len(notification_manager.records)
-    with qtbot.waitSignal(dock.runner.ready, timeout=MILLISECONDS):
-        dock.start()
+    with qtbot.waitSignal(dock.picture.runner.ready, timeout=MILLISECONDS):
+        dock.picture.start()
     (notice,) = [record.message for record in list(notification_manager.records)[before:]]
     assert "frame 2 holds NaN" in notice
     assert len(viewer.layers) == 1
-    assert not dock.runs.runs
+    assert not dock.picture.runs.runs
 
 
 def test_a_region_limits_the_run(open_dock, run_through, burst_layer):
@@ -69,7 +69,7 @@ def test_scale_units_and_labels_are_carried_over(open_dock, run_through, grey_fr
     layer = Image(grey_frames, scale=(1, 0.5, 0.25), translate=(0, 10, 20), units=("s", "um", "um"))
     layer.axis_labels = ("t", "y", "x")
     viewer, dock = open_dock(layer)
-    dock.form.set_choices({"upsample": 2.0})
+    dock.picture.form.set_choices({"upsample": 2.0})
     run = run_through(dock)
     switch_on(dock, "stabilised burst", "outlines", "path")
     image, still = viewer.layers["run 1: image"], viewer.layers["run 1: stabilised burst"]
@@ -152,7 +152,7 @@ def test_grey_layers_make_one_burst(open_dock, run_through, qtbot, simulated):
     switch_on(dock, "stabilised burst")
     for name in names:
         assert viewer.layers[f"run 1: stabilised burst of {name}"].data.shape == (8, 63, 75)
-    dock.display.card.switches["stabilised burst"].setChecked(False)
+    dock.picture.display.card.switches["stabilised burst"].setChecked(False)
     assert not [layer for layer in viewer.layers if "stabilised" in layer.name]
 
 
@@ -167,10 +167,10 @@ def test_a_dask_layer_is_a_burst(open_dock, run_through, grey_frames):
 
 def test_more_than_fits_is_refused_with_a_reason(open_dock, grey_frames):
     _, dock = open_dock(Image(np.broadcast_to(grey_frames[:1], (10**6, 63, 75))))
-    (notice,) = notices_during(dock.start)
+    (notice,) = notices_during(dock.picture.start)
     assert "GB of memory" in notice
     assert "draw a region" in notice
-    assert dock.runner.state == "ready"
+    assert dock.picture.runner.state == "ready"
 
 
 def test_a_truth_that_fits_no_longer_is_let_go(open_dock, run_through, burst_layer):
@@ -193,9 +193,9 @@ def test_axes_of_length_one_in_front_are_no_hindrance(open_dock, run_through, gr
 def test_axes_that_cannot_be_are_refused_before_the_run(open_dock, burst_layer, axes):
     _, dock = open_dock(burst_layer)
     dock.input.axes.setText(axes)
-    (notice,) = notices_during(dock.start)
+    (notice,) = notices_during(dock.picture.start)
     assert "let them end in C" in notice
-    assert dock.runner.state == "ready"
+    assert dock.picture.runner.state == "ready"
 
 
 def test_a_menu_command_on_something_else_says_so(open_dock, burst_layer):
@@ -203,4 +203,4 @@ def test_a_menu_command_on_something_else_says_so(open_dock, burst_layer):
     _, dock = open_dock(burst_layer, labels)
     (notice,) = notices_during(lambda: dock.start_on(labels))
     assert "is no image that could be a burst" in notice
-    assert dock.runner.state == "ready"
+    assert dock.picture.runner.state == "ready"

@@ -95,11 +95,11 @@ def test_the_wheel_scrolls_the_dock_and_turns_nothing(open_dock, run_through, bu
     viewer, dock = open_dock(burst_layer)
     run_through(dock)
     viewer.window.resize(1000, 400)
-    dock.display.curve_box.expand(animate=False)
+    dock.picture.display.curve_box.expand(animate=False)
     monkeypatch.setattr(QWidget, "hasFocus", lambda _: True)
-    number, box = dock.form.rows["upsample"].editor.native, dock.form.boxes["motion"]
-    plots = dock.display.curve_box.findChildren(PlotWidget)
-    (slider,) = dock.display.slider.findChildren(QSlider)
+    number, box = dock.picture.form.rows["upsample"].editor.native, dock.picture.form.boxes["motion"]
+    plots = dock.picture.display.curve_box.findChildren(PlotWidget)
+    (slider,) = dock.picture.display.slider.findChildren(QSlider)
     bar = dock.findChild(QScrollArea).verticalScrollBar()
     bar.setRange(0, 1000)
     before = number.value(), box.currentIndex(), slider.value(), [plot.viewRange() for plot in plots]
@@ -114,6 +114,6 @@ def test_the_wheel_scrolls_the_dock_and_turns_nothing(open_dock, run_through, bu
 def test_no_editor_widens_the_dock(open_dock, burst_layer, grey_frames):
     viewer, dock = open_dock(burst_layer, Image(grey_frames, name="a name that is longer than the dock is wide " * 3))
     dock.input.burst.value = viewer.layers[1]
-    dock.form.set_choices({"time_budget": 123456789.0, "seed": 2**31 - 1})
-    for widget in (dock.form, dock.input):
+    dock.picture.form.set_choices({"time_budget": 123456789.0, "seed": 2**31 - 1})
+    for widget in (dock.picture.form, dock.input):
         assert widget.minimumSizeHint().width() <= dock.sizeHint().width()

@@ -37,13 +37,13 @@ def answer(monkeypatch):
 def ran(open_dock, run_through, grey_frames):
     """Return a dock with a quick run of a layer that is called "lung & co", and the run."""
     _, dock = open_dock(Image(grey_frames, scale=(1, 0.5, 0.5), units=("s", "um", "um"), name="lung & co"))
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     return dock, run_through(dock)
 
 
 def save(dock, qtbot):
     """Press the button, wait for the end, and return what the dock says then."""
-    box = dock.display.card.report
+    box = dock.picture.display.card.report
     box.button.click()
     qtbot.waitUntil(lambda: box.button.isEnabled(), timeout=MILLISECONDS)
     return box.words.text()
@@ -51,10 +51,10 @@ def save(dock, qtbot):
 
 def test_the_report_of_the_run_that_is_shown_is_written_where_it_is_wanted(ran, run_through, qtbot, answer, tmp_path):
     dock, first = ran
-    dock.form.set_choices({**QUICK, "iterations": 3})
+    dock.picture.form.set_choices({**QUICK, "iterations": 3})
     run_through(dock)
     first.turned_live.append((1.25, "learning_rate", 0.5))
-    dock.runs.select(first)
+    dock.picture.runs.select(first)
     path = tmp_path / "lung report.html"
     answer(path)
     words = save(dock, qtbot)
@@ -76,7 +76,7 @@ def test_the_call_of_a_report_repeats_the_run(ran, qtbot, answer, tmp_path, grey
     save(dock, qtbot)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     call = unescape(page.split("<pre>")[1].split("</pre>")[0])
-    scope = {"viewer": dock.display.card._viewer}
+    scope = {"viewer": dock.picture.display.card._viewer}
     exec(call.replace('result.save("image.ome.tif")', ""), scope)
     np.testing.assert_allclose(scope["result"].image, run.result.image, rtol=1e-3)
 
@@ -86,11 +86,11 @@ def test_the_window_does_not_wait_for_a_report(ran, qtbot, answer, monkeypatch, 
     written = Event()
     monkeypatch.setattr(report_module, "write_report", lambda _, __, path, **___: written.wait(60) and Path(path))
     answer(tmp_path / "report.html")
-    box = dock.display.card.report
+    box = dock.picture.display.card.report
     box.button.click()
     assert box.words.text() == "Writing the report."
     assert not box.button.isEnabled()
-    dock.display.card.refresh()
+    dock.picture.display.card.refresh()
     assert not box.button.isEnabled()
     written.set()
     qtbot.waitUntil(lambda: box.button.isEnabled(), timeout=MILLISECONDS)
@@ -101,7 +101,7 @@ def test_the_dock_says_why_there_is_no_report(ran, qtbot, answer, monkeypatch, t
     dock, _ = ran
     answer(tmp_path / "nowhere" / "report.html")
     assert save(dock, qtbot).startswith("The report of run 1 was not written: ")
-    assert "nowhere" in dock.display.card.report.words.text()
+    assert "nowhere" in dock.picture.display.card.report.words.text()
     answer(tmp_path / "report.txt")
     assert "a report is written to a file ending in .html" in save(dock, qtbot)
     assert not list(tmp_path.glob("report*"))
@@ -118,28 +118,28 @@ def test_there_is_a_report_once_a_run_has_ended_and_none_where_no_place_is_given
     open_dock, run_through, qtbot, answer, burst_layer, tmp_path
 ):
     _, dock = open_dock(burst_layer)
-    box = dock.display.card.report
+    box = dock.picture.display.card.report
     assert box.isHidden()
-    dock.form.set_choices({**QUICK, "iterations": 100_000})
-    with qtbot.waitSignal(dock.runner.previewed, timeout=MILLISECONDS):
-        dock.start()
+    dock.picture.form.set_choices({**QUICK, "iterations": 100_000})
+    with qtbot.waitSignal(dock.picture.runner.previewed, timeout=MILLISECONDS):
+        dock.picture.start()
     assert box.isHidden()
-    with qtbot.waitSignal(dock.display.complete, timeout=MILLISECONDS):
-        dock.stop_button.click()
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        dock.picture.stop_button.click()
     assert not box.isHidden()
     answer("")
     assert save(dock, qtbot) == ""
     # What is said of one run's report is gone where another run is shown.
     answer(tmp_path / "report.html")
     assert save(dock, qtbot) != ""
-    dock.form.set_choices(QUICK)
+    dock.picture.form.set_choices(QUICK)
     run_through(dock)
     assert box.words.isHidden()
 
 
 def test_a_figure_of_the_run_that_is_shown_is_written_where_it_is_wanted(ran, qtbot, answer, tmp_path):
     dock, _ = ran
-    box = dock.display.card.report
+    box = dock.picture.display.card.report
     for name, begins in (("lung.svg", b"<svg"), ("lung.png", b"\x89PNG")):
         answer(tmp_path / name)
         box.figure_button.click()

@@ -32,11 +32,11 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
     trigger(viewer.window.plugins_menu, "Fiber burst reconstruction")
     (dock,) = viewer.window.dock_widgets.values()
     before = viewer.window.screenshot(canvas_only=True, flash=False)
-    with qtbot.waitSignal(dock.display.complete, timeout=120_000):
-        dock.start_button.click()
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=120_000):
+        dock.picture.start_button.click()
     qtbot.wait(200)
     after = viewer.window.screenshot(canvas_only=True, flash=False)
-    assert dock.runs.run.result.ending == "finished"
+    assert dock.picture.runs.run.result.ending == "finished"
     # All of the way from the burst to what came of it is in sight.
     viewer.window.resize(1280, 800)
     seen = dock.findChild(QScrollArea)

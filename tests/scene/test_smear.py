@@ -1,6 +1,8 @@
 """Frames that moved while they were exposed are seen to, and the scene is solved along the way that they went."""
 
+import numpy as np
 import pytest
+import skimage.data
 import torch
 
 from napari_fiberburst import reconstruct
@@ -9,6 +11,8 @@ from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.scene.smear import Smear
 from napari_fiberburst.scene.solve import Scene
 from napari_fiberburst.scene.spline import assemble
+from napari_fiberburst.simulation import Camera, simulate
+from napari_fiberburst.simulation import Scene as Object
 
 
 def found(burst, monkeypatch):
@@ -37,6 +41,15 @@ def test_frames_that_rest_while_they_are_exposed_are_left_alone(recorded, monkey
     result, told = found(recorded(frames=14, seed=4).burst, monkeypatch)
     assert told is None
     assert not any("exposed" in note for note in result.notes)
+
+
+def test_a_smooth_object_does_not_pass_for_a_smear(monkeypatch):
+    retina = skimage.data.retina()[200:1200, 200:1200].astype(np.float32) / 255
+    view = {"shape": (121, 147), "frames": 12, "pitch": 4.0, "channels": 1, "physics": "core", "seed": 4}
+    simulated = simulate(Object(retina, (200, 700)), camera=Camera(photons=20_000.0), **view)
+    result, told = found(simulated.burst, monkeypatch)
+    assert told is None
+    assert result.quality == "good"
 
 
 def test_equations_along_paths_see_the_mean_of_the_way():

@@ -39,6 +39,8 @@ _LEAST_FOUND = 0.6
 # Correlation of the brightness of cores with that of their neighbours taken out. A bundle with a perfect lattice can
 # be confused with another one, or with itself a pitch away, by places alone.
 _LEAST_ALIKE = 0.25
+# Cores whose brightness is a guess that differs by less than this part were taken as equal: places alone tell them.
+_LEAST_DIFFERENT = 0.1
 # A relative change of the distances between cores that is more than a re-plugged probe shows.
 _MOST_ZOOM = 0.01
 # The same, by how far neighbouring cores are apart: beyond it cores cannot be matched one by one.
@@ -270,10 +272,16 @@ def _zoom(motion: NDArray[np.float64], bundle: Bundle, observed: Observed) -> fl
 
 
 def _agreement(motion: NDArray[np.float64], bundle: Bundle, observed: Observed) -> tuple[float, float]:
-    """Return the share of cores found in their places, and the correlation of their brightness with the bundle's."""
+    """Return the share of cores found in their places, and the correlation of their brightness with the bundle's.
+
+    The latter is 1 where the bundle's cores were taken as equally bright, because it then says nothing.
+    """
     here, there, count = _matches(motion, bundle, observed, _NEAR * bundle.pitch)
     if len(here) < 8:
         return 0.0, 0.0
+    brightness = bundle.brightness
+    if not bundle.gains_known and brightness.std() < _LEAST_DIFFERENT * brightness.mean():
+        return len(here) / max(count, 1), 1.0
     flat = _flattened(torch.from_numpy(bundle.transmission), bundle.pitch)[0].numpy()
     known, shown = (
         map_coordinates(image, points.T[::-1], order=1) for image, points in ((flat, here), (observed.image, there))

@@ -4,8 +4,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.picture import write_png
@@ -39,7 +37,10 @@ def run(options: argparse.Namespace) -> int:
         check_place(options.output)
     if is_bundle:
         return _of_bundle(options.input, options.output)
+    from napari_fiberburst.pipeline.glance import glance  # torch takes seconds to load
+
     burst = read_burst(options.input, axes=options.axes)
+    seen = glance(burst)
     count, height, width, channels = burst.shape
     size = "unknown"
     if burst.pixel_size is not None:
@@ -54,6 +55,8 @@ def run(options: argparse.Namespace) -> int:
         ("brightest", f"{burst.frames.max() * (burst.white_level - burst.black_level) + burst.black_level:g}"),
         ("pixel size", size),
         ("times", times),
+        ("shows", seen.words),
+        *(("note", warning) for warning in seen.warnings),
     ):
         print(f"{name:15} {value}")
     return 0
@@ -61,26 +64,9 @@ def run(options: argparse.Namespace) -> int:
 
 def describe(bundle: "Bundle") -> None:
     """Print what a bundle has."""
-    height, width = bundle.shape
-    told = bundle.provenance
-    gains = "unknown" if not bundle.gains_known else f"known by {np.median(bundle.gain_weights):.2g} bright exposures"
-    places = {"cores": "cores", "unresolved": "blocks of pixels, because cores cannot be told apart"}
-    rows: tuple[tuple[str, object], ...] = (
-        ("height x width", f"{height} x {width}"),
-        (places.get(bundle.pattern, "blocks of pixels"), len(bundle.centres)),
-        ("pitch", f"{bundle.pitch:.2f} pixels"),
-        ("footprint", f"{bundle.radius:.2f} pixels radius"),
-        ("field", f"{bundle.outline.mean():.0%} of the frame"),
-        ("dead", len(bundle.dead)),
-        ("saturated", int(bundle.saturated.sum())),
-        ("black", f"{bundle.black:g}"),
-        ("offsets", f"up to {bundle.offsets.max():.3g}" if bundle.offsets.any() else "none"),
-        ("channels", bundle.gains.shape[1] if bundle.gains.shape[1] > 1 else "alike"),
-        ("gains", f"{gains}, {told.get('bursts', 0)} bursts"),
-        ("from", ", ".join([told.get("source", "unknown"), *told.get("files", [])])),
-        ("on", f"{told.get('date', 'unknown')}, version {told.get('version', 'unknown')}"),
-    )
-    for name, value in rows:
+    from napari_fiberburst.bundle.summary import summary  # torch takes seconds to load
+
+    for name, value in summary(bundle):
         print(f"{name:15} {value}")
 
 

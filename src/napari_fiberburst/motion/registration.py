@@ -50,7 +50,8 @@ class Registration(Stored):
     used : numpy.ndarray
         (T,) bool, frames that take part. The others could not be registered.
     confidence : numpy.ndarray
-        (T,) 0 to 1, how well each frame agrees with the others where they overlap; NaN while that is not known.
+        (T,) 0 to 1, how well each frame agrees with the others where they overlap; NaN while that is not known, and for
+        frames that show nothing.
     frame_weights : numpy.ndarray
         (T,) 0 to 1, how much each frame counts: blurred ones fit worse, and count less.
     gains : numpy.ndarray

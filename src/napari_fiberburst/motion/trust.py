@@ -43,16 +43,22 @@ def unexplained_part(found: Registration, samples: Samples, noise: float) -> flo
 
 def judged(found: Registration, samples: Samples) -> Registration:
     """Ask how far each frame is to be trusted, leave out those that are not, and see whether they move at all."""
+    shows = samples.weights.any(dim=1).cpu().numpy()
     samples = samples.weighted(torch.from_numpy(found.used))
     agreement = confidence(samples.positions, _evened(found, samples), samples.weights, found.motion, samples.pitch)
     trust = np.where(found.used, np.clip(agreement, 0, 1), 0.0)
     used = found.used & (trust >= max(LEAST_CONFIDENCE, _LEAST_OF_USUAL * np.median(trust[found.used])))
-    found = replace(found, used=used, confidence=trust, frame_weights=used.astype(np.float32))
+    known = np.where(shows, trust, np.nan)
+    found = replace(found, used=used, confidence=known, frame_weights=used.astype(np.float32))
     if used.sum() < 2:
         return found
-    if not used.all():
-        left_out = ", ".join(str(number) for number in np.flatnonzero(~used))
-        found = _noted(found, f"frames that could not be registered are left out: {left_out}")
+    for left_out, which in (
+        (~shows, "frames that show nothing, because they are black or over-exposed,"),
+        (shows & ~used, "frames that could not be registered"),
+    ):
+        if left_out.any():
+            numbers = ", ".join(str(number) for number in np.flatnonzero(left_out))
+            found = _noted(found, f"{which} are left out: {numbers}")
     travel = _travel(found.reference_from_frame[used], samples.shape)
     return replace(found, travel=travel, is_still=bool(travel < _LEAST_MOTION * samples.pitch))
 

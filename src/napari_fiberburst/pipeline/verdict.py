@@ -47,15 +47,20 @@ _SINGLE_CORES = 6.0
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
-_STRUCTURE, _BLURRED = 0.12, -0.03
+_STRUCTURE, _BLURRED = 0.12, -0.05
 # Power of what stands still in the residuals, 1 for noise.
 _STILL_PATTERN = 2.2
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
 _SHORT_TRAVEL = 0.4
 # In pitches, root mean square: frames that moved farther while they were exposed show no more of what lies along it.
 _LONG_SMEAR = 0.6
-# Frames that take part, at least; and as a part of all.
-_FEW_FRAMES, _LEAST_USED = 4, 0.5
+# Frames that take part, at least; and as a part of those that show anything: where more than a quarter differ from the
+# rest, the rest is not to be trusted either.
+_FEW_FRAMES, _LEAST_USED = 4, 0.72
+# Ratio of the light in the middle of the frame to that at its longer side's edge: bursts in even light have 0.8 to 1.4.
+_FALLING_OFF = 1.6
+# Places that show less than this part of the mean light do not count in it.
+_DARK = 0.02
 # In pitches, or pixels where these are the samples, the distance within which samples are neighbours; so many pairs of
 # them are enough.
 _NEIGHBOURS, _PAIRS = 1.4, 30_000
@@ -88,6 +93,9 @@ class GoodnessOfFit:
         would leave there: 1 for noise, less where gains were fitted.
     smear : float
         How far the frames moved while they were exposed, pixels (root mean square); 0 where that is not seen.
+    falloff : float
+        How much brighter the middle of the frame is than the edge of its longer side, as a ratio, once all that is
+        known of bundle and illumination is taken out.
     is_noise_known : bool
         Whether the noise was measured. Otherwise misfits are relative to 1 at full scale, and noise is what
         neighbouring samples do not share.
@@ -101,6 +109,7 @@ class GoodnessOfFit:
     structure: float
     still: float
     smear: float
+    falloff: float
     is_noise_known: bool
 
     def is_smeared_far(self, pitch: float) -> bool:
@@ -205,6 +214,7 @@ def collect(scene: Scene, registration: Registration, variance: Tensor | None) -
         structure=structure,
         still=_still_power(left),
         smear=0.0 if scene.smear is None else scene.smear.length,
+        falloff=_falloff(samples),
         is_noise_known=variance is not None,
     )
 
@@ -223,7 +233,8 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     gains_known : bool
         Whether the cores' gains were known before, so that motion need not tell them.
     """
-    used, count = int(registration.used.sum()), len(registration.used)
+    blank = np.isnan(registration.confidence) & ~registration.used
+    used, count = int(registration.used.sum()), int((~blank).sum())
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
@@ -266,9 +277,15 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
         reasons.append(
             "some cores fit much worse than others, such as those at a rim or under a mark: the image is wrong there"
         )
+    if fit.falloff > _FALLING_OFF and not gains_known and not registration.is_still:
+        reasons.append(
+            f"the middle of the frame is {fit.falloff:.1f} times as bright as its edge, and the motion does not tell "
+            'whether that is the light or the object; flatten="frame" takes it out, or an image of the bundle in even '
+            "light does"
+        )
     if count > 1 and used < max(2, _LEAST_USED * count):
         is_bad = is_bad or used < 2
-        reasons.append(f"only {used} of {count} frames could be registered")
+        reasons.append(f"only {used} of the {count} frames that show anything could be registered")
     is_few = 1 < count and used < _FEW_FRAMES
     if is_few and not gains_known:
         reasons.append(f"{used} frames tell little of the cores' gains; a bundle that is known would tell them")
@@ -296,6 +313,21 @@ def _change(samples: Samples) -> float:
     """Return the variance of what samples change from frame to frame, full scale 1."""
     mean = (samples.weights * samples.grey).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
     return _mean(samples.weights, (samples.grey - mean).square())
+
+
+def _falloff(samples: Samples) -> float:
+    """Return how much brighter the middle of the frame is than the edge of its longer side: by a parabola in logs."""
+    mass = samples.weights.sum(dim=0)
+    light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
+    seen = (mass > 0) & (light > _DARK * steady.weighted_mean(light, mass))
+    height, width = samples.shape
+    middle = torch.tensor([width - 1.0, height - 1.0]).to(light) / 2
+    places = 2 * (samples.positions[seen].to(light) - middle) / max(height, width)
+    terms = torch.cat([torch.ones_like(places[:, :1]), places, places.square().sum(dim=1, keepdim=True)], dim=1)
+    if int(seen.sum()) < 2 * terms.shape[1]:
+        return 1.0
+    fitted = np.linalg.lstsq(terms.double().cpu().numpy(), light[seen].log().double().cpu().numpy())[0]
+    return float(np.exp(-fitted[-1]))
 
 
 def _root_mean(squares: Tensor, known: Tensor, *, over: int) -> Tensor:

@@ -1,7 +1,7 @@
 """From napari's layers to a burst: which axis is which, what is known of the pixels, and where the truth lies."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -137,6 +137,14 @@ class BurstSource:
             times=self.times,
         )
         return burst if self.region is None else burst.crop(*self.region)
+
+    def some(self, frames: Sequence[int], rows: tuple[int, int], columns: tuple[int, int]) -> "BurstSource":
+        """Return the burst of some frames, and of these rows and columns, half-open, of what is used of them."""
+        (y0, _), (x0, _) = self.region or ((0, 0), (0, 0))
+        at = self.axes.find("T")
+        taken = self.arrays if at < 0 else tuple(array[(slice(None),) * at + (list(frames),)] for array in self.arrays)
+        region = ((y0 + rows[0], y0 + rows[1]), (x0 + columns[0], x0 + columns[1]))
+        return replace(self, arrays=taken, region=region, times=None, truth=None)
 
     def _whole(self) -> Any:
         """Return all of every frame, (T, H, W) or (T, H, W, C), in the layers' own type."""

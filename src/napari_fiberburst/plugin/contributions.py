@@ -15,11 +15,11 @@ from napari_fiberburst.io.read import ARCHIVE_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.data.burst import Burst
 
 LayerData = tuple[Any, dict[str, Any], str]
 PLUGIN = "napari-fiberburst"
-_WIDGET = "Fiber burst reconstruction"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
 # What a file of a simulated burst holds of the recording; all else is truth.
@@ -83,9 +83,7 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
 
 
 def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
-    """Open a bundle as its transmission, with the bundle itself in the metadata, and its cores as points.
-
-    Points are as large as a core's footprint. Saturated cores are red, dead ones blue.
+    """Open a bundle as the layers of `bundle_layers`.
 
     Raises
     ------
@@ -94,13 +92,29 @@ def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
     """
     from napari_fiberburst.bundle.bundle import Bundle
 
-    bundle, name = Bundle.load(str(path)), Path(str(path)).stem
+    return bundle_layers(Bundle.load(str(path)), Path(str(path)).stem, path=str(path))
+
+
+def bundle_layers(bundle: "Bundle", name: str, *, path: str | None = None) -> list[LayerData]:
+    """Return a bundle as its transmission, with the bundle itself in the metadata, and its cores as points.
+
+    Points are as large as a core's footprint. Saturated cores are red, dead ones blue.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        What to show.
+    name : str
+        Of the layer.
+    path : str, optional
+        The file that holds it.
+    """
     bright = float(np.quantile(bundle.transmission[bundle.outline], _BRIGHTEST)) if bundle.outline.any() else 1.0
     look = {
         "name": name,
         "axis_labels": ("y", "x"),
         "contrast_limits": (0.0, max(bright, 1e-6)),
-        "metadata": {METADATA_KEY: {"bundle": bundle, "path": str(path)}},
+        "metadata": {METADATA_KEY: {"bundle": bundle, "path": path}},
     }
     layers: list[LayerData] = [(bundle.transmission, look, "image")]
     if bundle.is_resolved:
@@ -176,19 +190,17 @@ def _start(show: str) -> None:
     import napari
     from napari.utils.notifications import show_error
 
-    from napari_fiberburst.plugin.dock import FiberBurstWidget
+    from napari_fiberburst.plugin.commands import find_dock
 
     viewer = napari.current_viewer()
     if viewer is None:
         return
     layer = viewer.layers.selection.active
-    # From the menu, napari opens the dock under another name than from here.
-    open_already = [widget for widget in viewer.window.dock_widgets.values() if isinstance(widget, FiberBurstWidget)]
-    widget = open_already[0] if open_already else viewer.window.add_plugin_dock_widget(PLUGIN, _WIDGET)[1]
+    dock = find_dock(viewer, may_open=True)
     if layer is None:
         show_error("no layer is selected; select the burst's layer")
-    else:
-        widget.start_on(layer, show)
+    elif dock is not None:
+        dock.start_on(layer, show)
 
 
 def _holds_frames(folder: Path) -> bool:

@@ -13,7 +13,7 @@ from qtpy.QtWidgets import QFileDialog, QLineEdit, QListWidget, QListWidgetItem,
 from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.plugin.bundles import BundleSource, bundle_source, is_result, may_be_bundle, may_be_burst
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
-from napari_fiberburst.plugin.contributions import read_bundle
+from napari_fiberburst.plugin.contributions import LayerData, read_bundle
 from napari_fiberburst.plugin.pickers import LayerPicker
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.recorded import take_recording
@@ -106,9 +106,13 @@ class InputBox(QWidget):
             opened = read_bundle(str(path))
         except FiberBurstError as error:
             show_error(str(error))
-            return
-        place = self._place_of_frames(opened[0][0].shape)
-        layers = [Layer.create(data, {**look, **place}, kind) for data, look, kind in opened]
+        else:
+            self.add_bundle(opened)
+
+    def add_bundle(self, made: list[LayerData]) -> None:
+        """Put the layers of a bundle over the burst, where they fit it, and choose the bundle."""
+        place = self._place_of_frames(made[0][0].shape)
+        layers = [Layer.create(data, {**look, **place}, kind) for data, look, kind in made]
         for layer in layers:
             self._viewer.add_layer(layer)
         self.reset_choices()

@@ -9,7 +9,7 @@ from qtpy.QtWidgets import QHeaderView, QTableWidget, QTableWidgetItem, QWidget
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.thumbnails import icon_of
 
-_LINES_OF_RUNS, _ICON = 3, 26
+_LINES_OF_RUNS, _ICON = 3, 20
 _WHOLE_ROWS = QItemSelectionModel.SelectionFlag.Rows
 _NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
 # What a row tells of a run, and in more words.
@@ -70,6 +70,12 @@ class RunsTable(QTableWidget):
         """Select a run alone."""
         self.setCurrentCell(self._row_of(run), 0, QItemSelectionModel.SelectionFlag.ClearAndSelect | _WHOLE_ROWS)
 
+    def step(self, by: int) -> None:
+        """Select the run that is so many rows further down, as far as there is one."""
+        run = self._run_of(min(max(self.currentRow() + by, 0), self.rowCount() - 1))
+        if run is not None:
+            self.select(run)
+
     def take_out(self, run: KeptRun) -> None:
         """Show a run no more; says nothing of which is the current one then."""
         with self._quiet():
@@ -97,13 +103,13 @@ class RunsTable(QTableWidget):
         header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
         header.setSortIndicator(-1, Qt.SortOrder.AscendingOrder)
         rows.setVisible(False)
-        rows.setDefaultSectionSize(_ICON + 2)
+        rows.setDefaultSectionSize(_ICON + 1)
         self.setIconSize(QSize(_ICON, _ICON))
         self.setSelectionBehavior(QTableWidget.SelectionBehavior.SelectRows)
         self.setSelectionMode(QTableWidget.SelectionMode.ExtendedSelection)
         self.setSortingEnabled(True)
         self.setShowGrid(False)
-        self.setFixedHeight(_LINES_OF_RUNS * (_ICON + 2) + self.fontMetrics().height() + 2 * _ABOVE_AND_BELOW)
+        self.setFixedHeight(_LINES_OF_RUNS * (_ICON + 1) + self.fontMetrics().height() + 2 * _ABOVE_AND_BELOW)
 
     def _run_of(self, row: int) -> KeptRun | None:
         item = self.item(row, 0)

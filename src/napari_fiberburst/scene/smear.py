@@ -27,8 +27,8 @@ _PARTS, _PROBED = (0.0, 0.25, 0.5, 0.75, 1.0), 0.5
 # its detail in them, so that bursts that are not smeared have -0.12 to -2.3, and those smeared by two pixels 0.03 up.
 _LEAST_SCORE = -0.045
 # In a window of so many nodes a side, at this smoothness and with so many iterations, the misfit has to fall by this
-# part.
-_WINDOW, _SMOOTHNESS, _ITERATIONS, _LEAST_GAIN = 128, 0.01, 24, 0.05
+# part. It does not in bursts that are not smeared.
+_WINDOW, _SMOOTHNESS, _ITERATIONS, _LEAST_GAIN = 128, 0.01, 24, 0.03
 _FEWEST_FRAMES = 5
 
 
@@ -85,7 +85,8 @@ def find_smear(
         return None
     way = ways[int(np.argmax(scores))]
     window = liveliest(grid, scene.mean(dim=0), _WINDOW)
-    left = np.array([_left(grey, replace(way, part=part).paths(points), window) for part in _PARTS])
+    within = _within(window, grey, replace(way, part=_PARTS[-1]).paths(points))
+    left = np.array([_left(within, replace(way, part=part).paths(points), window) for part in _PARTS])
     return replace(way, part=_lowest(left)) if left.min() < (1 - _LEAST_GAIN) * left[0] else None
 
 
@@ -127,6 +128,18 @@ def _lowest(left: NDArray[np.float64]) -> float:
     curve = np.polyfit(_PARTS[near], left[near], 2)
     lowest = -curve[1] / (2 * curve[0]) if curve[0] > 0 else _PARTS[int(np.argmin(left))]
     return float(np.clip(lowest, _PARTS[0], _PARTS[-1]))
+
+
+def _within(window: Grid, samples: Samples, paths: Tensor) -> Samples:
+    """Return those samples that see nothing beyond a window, along paths (T, N, K, 2) and a pitch beside them.
+
+    What a sample sees there no scene in the window explains, and that is less the longer the path: where the object is
+    smooth, it would pass for a smear.
+    """
+    first = torch.tensor([window.x0, window.y0]).to(paths)
+    last = first + torch.tensor([window.shape[1] - 1.0, window.shape[0] - 1.0]).to(paths) * window.spacing
+    inside = ((paths > first + samples.pitch) & (paths < last - samples.pitch)).all(dim=3).all(dim=2)
+    return replace(samples, weights=samples.weights * inside)
 
 
 def _left(samples: Samples, looks: Tensor, window: Grid) -> float:

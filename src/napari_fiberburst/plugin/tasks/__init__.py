@@ -1,0 +1,7 @@
+"""What the dock can be asked to do with a burst, in the order it is offered."""
+
+from napari_fiberburst.plugin.tasks.bundle import BundleTask
+from napari_fiberburst.plugin.tasks.picture import PictureTask
+from napari_fiberburst.plugin.tasks.task import Task
+
+TASKS: tuple[type[Task], ...] = (PictureTask, BundleTask)

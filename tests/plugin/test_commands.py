@@ -1,0 +1,95 @@
+"""Keys and napari's command palette do what the dock's buttons do."""
+
+import pytest
+from napari.components import ViewerModel
+from napari.settings import get_settings
+from napari.utils.action_manager import action_manager
+from napari.utils.key_bindings import coerce_keybinding
+from napari.utils.notifications import notification_manager
+from npe2 import PluginManifest
+from qtpy.QtCore import QEvent, QPoint, Qt
+from qtpy.QtGui import QHelpEvent
+from qtpy.QtWidgets import QApplication, QToolTip
+
+from napari_fiberburst.plugin import commands
+from napari_fiberburst.plugin.tasks.bundle import BundleTask
+
+MILLISECONDS = 60_000
+
+
+def hint(widget):
+    """Return the tooltip that a pointer over a widget brings up."""
+    widget.window().show()
+    QApplication.sendEvent(widget, QHelpEvent(QEvent.Type.ToolTip, QPoint(1, 1), widget.mapToGlobal(QPoint(1, 1))))
+    return QToolTip.text()
+
+
+def test_a_key_starts_starts_a_run(open_dock, burst_layer, qtbot):
+    _, dock = open_dock(burst_layer)
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        qtbot.keyClick(dock.picture.start_button, Qt.Key.Key_Return, Qt.KeyboardModifier.ControlModifier)
+    assert [run.name for run in dock.picture.runs.runs] == ["run 1"]
+
+
+def test_commands_of_the_palette_act_on_the_dock_that_is_open(open_dock, burst_layer, qtbot, run_through):
+    _, dock = open_dock(burst_layer)
+    first, second = run_through(dock), run_through(dock)
+    commands.next_run()
+    assert dock.picture.runs.run is first
+    commands.next_run()
+    assert dock.picture.runs.run is first
+    commands.previous_run()
+    assert dock.picture.runs.run is second
+    with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+        commands.start()
+        commands.pause()
+        assert dock.picture.runner.state == "paused"
+        commands.pause()
+    assert len(dock.picture.runs.runs) == 3
+
+
+def test_start_belongs_to_the_task_that_is_shown(open_dock, burst_layer, qtbot):
+    _, dock = open_dock(burst_layer)
+    dock.choose_task(BundleTask)
+    commands.start()
+    qtbot.waitUntil(lambda: dock.input.bundle.value is not None, timeout=MILLISECONDS)
+    assert dock.picture.runner.state == "ready"
+
+
+def test_what_cannot_be_done_now_is_said(open_dock, burst_layer):
+    _, dock = open_dock(burst_layer)
+    commands.stop()
+    assert (
+        notification_manager.records[-1].message
+        == f"Stop the run and keep it: not now. {dock.picture.stop_button.toolTip()}"
+    )
+
+
+def test_start_opens_the_dock_and_the_others_say_that_it_is_closed(make_napari_viewer, npe2pm):
+    npe2pm.register(PluginManifest.from_distribution("napari-fiberburst"))
+    viewer = make_napari_viewer()
+    commands.pause()
+    assert "the dock is not open" in notification_manager.records[-1].message
+    assert not viewer.window.dock_widgets
+    commands.start()
+    assert len(viewer.window.dock_widgets) == 1
+
+
+def test_every_command_is_in_the_manifest_and_has_a_key_that_napari_can_change(open_dock):
+    manifest = PluginManifest.from_distribution("napari-fiberburst")
+    titles = {command.id.partition(".")[2]: command.title for command in manifest.contributions.commands}
+    open_dock()
+    for name, command in commands.COMMANDS.items():
+        assert titles[name] == command.title
+        if command.key is not None:
+            assert coerce_keybinding(command.key) in ViewerModel.class_keymap
+
+
+@pytest.mark.parametrize(("chosen", "told"), [(None, "Ctrl+↵"), (["Alt-Q"], "Alt+Q")])
+def test_tooltips_tell_the_key_that_is_in_force(open_dock, burst_layer, monkeypatch, chosen, told):
+    shortcuts = get_settings().shortcuts.shortcuts
+    if chosen is not None:
+        monkeypatch.setitem(shortcuts, "napari-fiberburst:start", chosen)
+    _, dock = open_dock(burst_layer)
+    assert hint(dock.picture.start_button) == f"Reconstruct the burst; everything sets itself. ({told})"
+    action_manager.unbind_shortcut("napari-fiberburst:start")
