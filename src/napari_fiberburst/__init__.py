@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.pipeline.remeasure import flatten as flatten
     from napari_fiberburst.pipeline.remeasure import remeasure as remeasure
     from napari_fiberburst.pipeline.render import render as render
+    from napari_fiberburst.report import write_figure as write_figure
     from napari_fiberburst.report import write_report as write_report
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
     from napari_fiberburst.results.progress import Progress as Progress
@@ -63,6 +64,7 @@ _HOMES = {
     "render": "pipeline.render",
     "sample": "bundle.samples",
     "solve": "scene.solve",
+    "write_figure": "report",
     "write_report": "report",
 }
 

@@ -1,18 +1,25 @@
 """A viewer with the dock in it, and a burst to run; nothing is written to the user's own settings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from napari.components import ViewerModel
 from napari.layers import Image
 from napari.utils import progress
 from qtpy.compat import isalive
 from qtpy.QtCore import QSettings
 
+from napari_fiberburst import Reconstruction
+from napari_fiberburst.plugin.bursts import source_of
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.plugin.kept_run import KeptRun
+from napari_fiberburst.plugin.layers import RunLayers
+from napari_fiberburst.plugin.placement import Placement
+from napari_fiberburst.plugin.runs import RunsPanel
 from napari_fiberburst.simulation import SimulatedBurst, simulate
 
 MILLISECONDS = 60_000
@@ -90,3 +97,51 @@ def ome_file(tmp_path, simulated) -> Path:
     }
     tifffile.imwrite(path, simulated.arrays()["frames"][..., :2].transpose(0, 3, 1, 2), metadata=told)
     return path
+
+
+@pytest.fixture
+def kept_run() -> Callable[..., KeptRun]:
+    """Return a function that keeps a result of a burst layer as a run, with its image in a viewer."""
+
+    def kept(
+        viewer: ViewerModel,
+        layers: Sequence[Image],
+        axes: str,
+        result: Reconstruction,
+        name: str = "run 1",
+        **source: Any,
+    ) -> KeptRun:
+        region = source.get("region") or ((0, 0), (0, 0))
+        placement = Placement.of(layers, axes, (region[0][0], region[1][0]))
+        run = KeptRun(
+            name=name,
+            python="",
+            source=source_of(layers, axes, **source),
+            choices={},
+            layers=RunLayers(viewer, name, placement, {"run": name}),
+        )
+        run.result = result
+        run.layers.finish(result, run.source.frames)
+        return run
+
+    return kept
+
+
+@pytest.fixture(scope="session")
+def grey_result(tiny_simulation, fit):
+    """Return a result of grey frames; its image is the tests' to replace."""
+    return fit(tiny_simulation.arrays()["frames"][..., 1], iterations=1)
+
+
+@pytest.fixture
+def viewer():
+    """Return a viewer without a window."""
+    return ViewerModel()
+
+
+@pytest.fixture
+def panel(qtbot, viewer):
+    """Return a panel of the runs in it."""
+    made = RunsPanel(viewer)
+    qtbot.addWidget(made)
+    return made

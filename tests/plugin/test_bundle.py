@@ -13,6 +13,7 @@ import napari_fiberburst
 from napari_fiberburst import Bundle
 from napari_fiberburst.errors import BundleError
 from napari_fiberburst.plugin import contributions
+from napari_fiberburst.plugin.saving import keep_bundle
 
 MILLISECONDS = 60_000
 ROOT = Path(napari_fiberburst.__file__).parent
@@ -80,7 +81,7 @@ def test_a_bundle_that_is_kept_and_opened_again_serves_one_frame(
     path = tmp_path / "probe.bundle"
     viewer, dock = open_dock(burst_layer)
     first = run_through(dock)
-    dock.picture.runs.keep_bundle(first, path)
+    keep_bundle(first, path)
     dock.input.open_bundle(path)
     assert dock.input.bundle.value is viewer.layers["probe"]
     viewer.add_layer(frame_layer)
@@ -118,7 +119,7 @@ def test_a_bundle_that_was_given_is_kept_improved(open_dock, run_through, burst_
     _, dock = open_dock(burst_layer)
     dock.input.open_bundle(bundle_file)
     run = run_through(dock)
-    dock.picture.runs.keep_bundle(run, tmp_path / "better.bundle")
+    keep_bundle(run, tmp_path / "better.bundle")
     better = Bundle.load(tmp_path / "better.bundle")
     np.testing.assert_array_equal(better.centres, bundle.centres)
     assert better.provenance["bursts"] == bundle.provenance["bursts"] + 1
@@ -131,7 +132,7 @@ def test_an_image_in_even_light_is_kept_as_a_bundle_improved(open_dock, run_thro
     _, dock = open_dock(burst_layer, even)
     dock.input.burst.value, dock.input.bundle.value = burst_layer, even
     run = run_through(dock)
-    dock.picture.runs.keep_bundle(run, tmp_path / "even.bundle")
+    keep_bundle(run, tmp_path / "even.bundle")
     kept = Bundle.load(tmp_path / "even.bundle")
     assert (kept.provenance["source"], kept.provenance["bursts"]) == ("image", 1)
     assert "calibration=viewer.layers['even'].data" in run.python
@@ -139,14 +140,14 @@ def test_an_image_in_even_light_is_kept_as_a_bundle_improved(open_dock, run_thro
 
 def test_only_a_run_with_a_resolved_bundle_offers_to_keep_it(open_dock, run_through, burst_layer):
     _, dock = open_dock(burst_layer)
-    assert not dock.picture.runs.keep_button.isEnabled()
+    assert not dock.picture.runs.save.bundle.isEnabled()
     run_through(dock)
-    assert dock.picture.runs.keep_button.isEnabled()
+    assert dock.picture.runs.save.bundle.isEnabled()
     dock.picture.form.set_choices(
         {"preset": "paper", "iterations": 2, "scene_width": 16, "scene_layers": 1, "features": 16}
     )
     published = run_through(dock)
-    assert not dock.picture.runs.keep_button.isEnabled()
+    assert not dock.picture.runs.save.bundle.isEnabled()
     with pytest.raises(BundleError, match="has found no bundle"):
         published.bundle_to_keep()
 
@@ -154,7 +155,7 @@ def test_only_a_run_with_a_resolved_bundle_offers_to_keep_it(open_dock, run_thro
 def test_a_bundle_written_under_another_ending_is_refused_in_words(open_dock, run_through, burst_layer, tmp_path):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
-    (notice,) = notices_during(lambda: dock.picture.runs.keep_bundle(run, tmp_path / "probe.tif"))
+    (notice,) = notices_during(lambda: keep_bundle(run, tmp_path / "probe.tif"))
     assert "ending in .bundle" in notice
     assert list(tmp_path.glob("probe*")) == []
 
@@ -230,7 +231,7 @@ def test_the_keep_button_asks_where_to(open_dock, run_through, monkeypatch, burs
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
     monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
-    dock.picture.runs.keep_button.click()
+    dock.picture.runs.save.bundle.click()
     assert suggested == ["burst.bundle"]
     np.testing.assert_array_equal(Bundle.load(tmp_path / "kept.bundle").centres, run.result.bundle.centres)
 

@@ -11,6 +11,7 @@ from npe2 import PluginManifest
 
 from napari_fiberburst.plugin import contributions
 from napari_fiberburst.plugin.preferences import Preferences, preferences
+from napari_fiberburst.plugin.saving import save_homographies, save_result
 from napari_fiberburst.simulation import SCENES, Faults, simulate
 
 MANIFEST = PluginManifest.from_distribution("napari-fiberburst")
@@ -151,14 +152,14 @@ def test_preferences_come_from_naparis_page(plugin_settings, npe2pm):
 def test_results_are_saved_from_the_list_of_runs(open_dock, run_through, burst_layer, tmp_path):
     _, dock = open_dock(burst_layer)
     run = run_through(dock)
-    dock.picture.runs.save_result(run, tmp_path / "p.ome.tif")
-    dock.picture.runs.save_homographies(run, tmp_path / "h.csv")
-    dock.picture.runs.save_homographies(run, tmp_path / "h.json")
+    save_result(run, tmp_path / "p.ome.tif")
+    save_homographies(run, tmp_path / "h.csv")
+    save_homographies(run, tmp_path / "h.json")
     table = np.loadtxt(tmp_path / "h.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(table[:, 1:].reshape(-1, 3, 3), run.result.homographies)
     stored = json.loads((tmp_path / "h.json").read_text())["frames"]
     np.testing.assert_array_equal([frame["homography"] for frame in stored], run.result.homographies)
     assert (tmp_path / "p.json").exists()
     before = sorted(tmp_path.iterdir())
-    dock.picture.runs.save_homographies(run, tmp_path / "h.txt")
+    save_homographies(run, tmp_path / "h.txt")
     assert sorted(tmp_path.iterdir()) == before

@@ -188,8 +188,7 @@ def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock
             for plot in dock.picture.display.curve_box.findChildren(PlotWidget)
             if plot.getAxis("left").labelText == "loss"
         ]
-        seconds = plot.listDataItems()[0].getOriginalDataset()[0]
-        return [] if seconds is None else seconds
+        return plot.listDataItems()[0].getOriginalDataset()[0] if plot.listDataItems() else []
 
     dock.picture.display.curve_box.expand(animate=False)
     np.testing.assert_array_equal(drawn(), [point.seconds for point in second.curve if np.isfinite(point.loss)])
@@ -381,20 +380,6 @@ def test_a_row_tells_what_came_of_its_run(open_dock, run_through, burst_layer):
     assert float(cells[2]) == round(result.seconds, 1)
     assert cells[3] == result.quality
     assert float(cells[4]) == pytest.approx(result.held_out_rmse, rel=0.01)
-
-
-def test_comparing_shows_one_image_alone(open_dock, run_through, burst_layer):
-    viewer, dock = open_dock(burst_layer)
-    dock.picture.form.set_choices(QUICK)
-    for _ in range(3):
-        run_through(dock)
-    dock.picture.runs.select(dock.picture.runs.runs[0])
-    dock.picture.runs.other.setCurrentIndex(1)
-    dock.picture.runs.compare_button.click()
-    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 2, 3)] == [False, True, False]
-    dock.picture.runs.remove(dock.picture.runs.runs[1])
-    assert not dock.picture.runs.compare_button.isChecked()
-    assert [viewer.layers[f"run {number}: image"].visible for number in (1, 3)] == [True, False]
 
 
 def test_a_burst_that_bends_is_drawn_as_it_bends_and_judged(open_dock, run_through):

@@ -8,6 +8,7 @@ from napari.utils.notifications import notification_manager
 from npe2 import PluginManifest
 
 from napari_fiberburst import read_burst
+from napari_fiberburst.plugin.saving import save_result
 
 MILLISECONDS = 60_000
 
@@ -98,7 +99,7 @@ def test_what_an_ome_tiff_says_is_in_results_although_napari_opens_it(
     image = viewer.layers["run 1: image"]
     np.testing.assert_array_equal(image.scale[-2:], [0.5, 0.25])
     assert [str(unit) for unit in image.units[-2:]] == ["micrometer", "micrometer"]
-    dock.picture.runs.save_result(run, tmp_path / "out.ome.tif")
+    save_result(run, tmp_path / "out.ome.tif")
     written = read_burst(tmp_path / "out.ome.tif", axes="CYX")
     assert (written.pixel_size, written.unit) == ((0.5, 0.25), "µm")
     assert written.channel_names == ("red", "green")

@@ -135,3 +135,22 @@ def test_there_is_a_report_once_a_run_has_ended_and_none_where_no_place_is_given
     dock.picture.form.set_choices(QUICK)
     run_through(dock)
     assert box.words.isHidden()
+
+
+def test_a_figure_of_the_run_that_is_shown_is_written_where_it_is_wanted(ran, qtbot, answer, tmp_path):
+    dock, _ = ran
+    box = dock.picture.display.card.report
+    for name, begins in (("lung.svg", b"<svg"), ("lung.png", b"\x89PNG")):
+        answer(tmp_path / name)
+        box.figure_button.click()
+        assert box.words.text() == "Writing the figure."
+        assert not box.button.isEnabled()
+        qtbot.waitUntil(lambda: box.figure_button.isEnabled(), timeout=MILLISECONDS)
+        assert box.words.text().startswith("The figure of run 1 is in ")
+        assert (tmp_path / name).as_uri() in box.words.text()
+        assert (tmp_path / name).read_bytes().startswith(begins)
+    assert "µm" in (tmp_path / "lung.svg").read_text(encoding="utf-8")
+    answer(tmp_path / "lung.pdf")
+    box.figure_button.click()
+    qtbot.waitUntil(lambda: box.figure_button.isEnabled(), timeout=MILLISECONDS)
+    assert "a figure is written to a file ending in .png or .svg" in box.words.text()

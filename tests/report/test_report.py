@@ -150,7 +150,7 @@ def test_places_that_cannot_be_written_are_refused_before_the_run(tmp_path, caps
     for options, said in (
         (["--report", str(tmp_path / "report.pdf")], "ending in .html"),
         (["--report", str(tmp_path / "nowhere" / "report.html")], "does not exist"),
-        ([], "add -o image.ome.tif, --report report.html, or both"),
+        ([], "add -o image.ome.tif, --report report.html or --figure figure.svg"),
     ):
         assert main(["reconstruct", str(tmp_path / "none.npz"), *options]) == 2
         assert said in capsys.readouterr().err

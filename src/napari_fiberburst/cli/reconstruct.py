@@ -18,7 +18,7 @@ from napari_fiberburst.control import Control
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.results import check_output
-from napari_fiberburst.report import check_report, write_report
+from napari_fiberburst.report import check_figure, check_report, write_figure, write_report
 from napari_fiberburst.settings import PublishedMethod, Settings, choose
 
 if TYPE_CHECKING:
@@ -44,6 +44,9 @@ def add_to(commands: Any) -> None:
         "the fitted networks",
     )
     parser.add_argument("--report", type=Path, help="report.html, with all that is known of the image, in one file")
+    parser.add_argument(
+        "--figure", type=Path, help="figure.svg or figure.png: a captured frame beside the image, fit for a paper"
+    )
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.add_argument("--black-level", type=float, help="intensity that stands for no light")
@@ -63,12 +66,17 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read, fit, write. Returns 130 where the fit was interrupted, though its image was written."""
-    if options.output is None and options.report is None:
-        raise OutputError("expected somewhere to write to; add -o image.ome.tif, --report report.html, or both")
+    places = [path for path in (options.output, options.report, options.figure) if path is not None]
+    if not places:
+        raise OutputError(
+            "expected somewhere to write to; add -o image.ome.tif, --report report.html or --figure figure.svg"
+        )
     if options.output is not None:
         check_output(options.output, options.input)
     if options.report is not None:
         check_report(options.report)
+    if options.figure is not None:
+        check_figure(options.figure)
     choices = settings_of(options)
     settings = choose(**choices)
     _check(options, settings)
@@ -99,6 +107,8 @@ def run(options: argparse.Namespace) -> int:
         if options.report is not None:
             call = shlex.join(["fiberburst", *options.words])
             write_report(result, burst, options.report, name=options.input.name, call=call)
+        if options.figure is not None:
+            write_figure(result, burst, options.figure)
     steps = len(result.losses)
     rate = steps / result.seconds
     print(f"{result.ending} after {steps} steps in {result.seconds:.1f} s on {result.device}, {rate:.1f} it/s")
@@ -112,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     if result.quality is not None:
         print(f"the image is {result.quality}{'' if result.quality == 'good' else ': ' + '; '.join(result.notes)}")
-    print(f"wrote {' and '.join(str(path) for path in (options.output, options.report) if path is not None)}")
+    print(f"wrote {' and '.join(map(str, places))}")
     if options.keep_bundle is not None:
         _keep(options.keep_bundle, result, known)
     return INTERRUPTED if result.ending == "stopped" else 0

@@ -8,8 +8,8 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QGridLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.plugin.evidence import KINDS
+from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.reporting import ReportBox
-from napari_fiberburst.plugin.runs import KeptRun
 
 _COLUMNS = 2
 # Of a verdict; they are told apart by their words too.

@@ -16,7 +16,7 @@ from napari.utils.interactions import Shortcut
 from napari.utils.notifications import show_info
 from qtpy.QtCore import QEvent, QObject
 from qtpy.QtGui import QHelpEvent
-from qtpy.QtWidgets import QAbstractButton, QTableWidget, QToolTip, QWidget
+from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 
 from napari_fiberburst.plugin.contributions import PLUGIN
 
@@ -59,21 +59,21 @@ COMMANDS = {
     ),
     "stop": Command(title="Stop the run and keep it", key="Ctrl-Shift-E", widget=lambda dock: dock.picture.stop_button),
     "compare": Command(
-        title="Compare two runs", key="Ctrl-Shift-B", widget=lambda dock: dock.picture.runs.compare_button
+        title="Compare two images", key="Ctrl-Shift-B", widget=lambda dock: dock.picture.runs.compare.button
     ),
-    "save": Command(title="Save the result", key="Ctrl-Shift-S", widget=lambda dock: dock.picture.runs.save_button),
+    "save": Command(title="Save the result", key="Ctrl-Shift-S", widget=lambda dock: dock.picture.runs.save.result),
     "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
     "next_run": Command(
         title="Next run",
         key="Ctrl-Shift-Down",
         widget=lambda dock: dock.picture.runs.table,
-        act=lambda table: _step(table, 1),
+        act=lambda table: table.step(1),
     ),
     "previous_run": Command(
         title="Previous run",
         key="Ctrl-Shift-Up",
         widget=lambda dock: dock.picture.runs.table,
-        act=lambda table: _step(table, -1),
+        act=lambda table: table.step(-1),
     ),
 }
 
@@ -155,8 +155,3 @@ def bind_keys() -> None:
 
 def _action(name: str) -> str:
     return f"{PLUGIN}:{name}"
-
-
-def _step(table: QTableWidget, by: int) -> None:
-    """Select the row that is so many further down, as far as there is one."""
-    table.setCurrentCell(min(max(table.currentRow() + by, 0), table.rowCount() - 1), 0)

@@ -1,5 +1,6 @@
 """What a run shows while it goes and when it is done: its state in words, its image, its curves, its past."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from napari_fiberburst.plugin.card import ResultCard
 from napari_fiberburst.plugin.curves import Curves
 from napari_fiberburst.plugin.history import HistoryEntry
 from napari_fiberburst.plugin.job import Job
-from napari_fiberburst.plugin.runs import KeptRun
+from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.sections import section
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ class Display(QObject):
         self.curve_box = section("Curves", self._curves)
         self.status_box, self.past_box = self._lay_out()
         self._selected: KeptRun | None = None
+        self._charted: Sequence[KeptRun] = ()
         self.slider.valueChanged.connect(self._scrub)
         self.curve_box.toggled.connect(lambda _: self._draw_curves())
 
@@ -104,7 +106,7 @@ class Display(QObject):
         self.status.setText("The run failed. Change the settings or the burst, and press Start.")
 
     def select(self, run: KeptRun | None) -> None:
-        """Let curves and history be those of a run, at its newest image.
+        """Let card and history be those of a run, at its newest image.
 
         One that was gone back through shows that image again.
         """
@@ -115,12 +117,16 @@ class Display(QObject):
         self._selected = run
         if run is not before:
             self.card.show_run(run)
-            self._curves.clear()
-            self._draw_curves()
         self.slider.blockSignals(True)
         self.slider.setMaximum(0 if run is None else max(0, len(run.history.entries) - 1))
         self.slider.setValue(self.slider.maximum())
         self.slider.blockSignals(False)
+
+    def chart(self, runs: Sequence[KeptRun]) -> None:
+        """Let curves be those of some runs, by their names."""
+        self._charted = runs
+        self._curves.clear()
+        self._draw_curves()
 
     def shut_down(self) -> None:
         """Show nothing more. May be called more than once."""
@@ -149,9 +155,8 @@ class Display(QObject):
         return state, past
 
     def _draw_curves(self) -> None:
-        run = self._selected
-        if run is not None and self.curve_box.isExpanded():
-            self._curves.show_points(run.curve, run.span)
+        if self.curve_box.isExpanded():
+            self._curves.show_runs(self._charted)
 
     def _scrub(self, index: int) -> None:
         """Show an image of the past."""

@@ -22,7 +22,7 @@ from napari_fiberburst.plugin.evidence import (
     path,
     result_layers,
 )
-from napari_fiberburst.plugin.placement import COLOUR_LIMITS, Placement, as_colour
+from napari_fiberburst.plugin.placement import COLOUR_LIMITS, Placement
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
@@ -53,6 +53,7 @@ class RunLayers:
         self._viewer, self._name, self.placement = viewer, name, placement
         self._common = dict(metadata)
         self._layers: dict[str, Layer] = {}
+        self._places: dict[int, Layer] = {}
         self._is_removed = False
         self._drawn_at: NDArray[np.float64] | None = None
         self._limits: dict[str, tuple[float, float]] = {}
@@ -68,14 +69,15 @@ class RunLayers:
 
     def show_image(self, image: NDArray[np.float32], acquisition: Acquisition, canvas: "Canvas") -> None:
         """Show an image (H, W) or (H, W, C) in intensity units, in the layers that are there for it, or new ones."""
-        for number, (kind, data, axes) in enumerate(self._parts(image, acquisition)):
-            placed = self.placement.on_canvas(axes, canvas)
+        for number, (kind, data, axes) in enumerate(self.placement.parts(image, acquisition)):
             layer = self._layers.get(kind)
             if layer is None:
-                self._add_image(kind, data, placed, self.placement.colormaps[number])
+                self._insert(kind, image_layer(data, axes, self.placement, canvas, number))
+                if kind in self._layers and not self.placement.rgb:
+                    self._limits[kind] = tuple(self._layers[kind].contrast_limits)
             elif self._has(layer):
                 if self._drawn_at is None or not np.array_equal(self._drawn_at, canvas.reference_from_image):
-                    for attribute, value in placed.items():
+                    for attribute, value in self.placement.on_canvas(axes, canvas).items():
                         setattr(layer, attribute, value)
                 self._fit_contrast(kind, layer, data)
                 layer.data = data
@@ -156,39 +158,27 @@ class RunLayers:
             if _is_of(name, kind) and self._has(layer):
                 layer.visible = visible
 
+    def take_out(self) -> None:
+        """Take all layers of the run out of the viewer, until they are put back."""
+        layers = self._viewer.layers
+        self._is_removed = True
+        self._places = {layers.index(layer): layer for layer in self._layers.values() if self._has(layer)}
+        for layer in self._places.values():
+            layers.remove(layer)
+
+    def put_back(self) -> None:
+        """Put the layers that were taken out back into their places."""
+        self._is_removed = False
+        for place, layer in sorted(self._places.items()):
+            self._add(layer, min(place, len(self._viewer.layers)))
+        self._places = {}
+
     def remove(self) -> None:
         """Take all layers of the run out of the viewer, for good."""
-        self._is_removed = True
-        for layer in self._layers.values():
-            if self._has(layer):
-                self._viewer.layers.remove(layer)
+        self.take_out()
         self._layers.clear()
+        self._places = {}
         self._result = self._frames = self._motion = None
-
-    def _parts(
-        self, image: NDArray[np.float32], acquisition: Acquisition
-    ) -> list[tuple[str, NDArray[np.float32], str]]:
-        """Return kind, data and axes of each layer that the image takes."""
-        if self.placement.channels:
-            return [
-                (f"image of {name}", *self.placement.arrange(image[..., number], "YX"))
-                for number, name in enumerate(self.placement.channels)
-            ]
-        if self.placement.rgb:
-            return [("image", as_colour(image, acquisition), "YX")]
-        return [("image", *self.placement.arrange(image, "YXC"[: image.ndim]))]
-
-    def _add_image(self, kind: str, data: NDArray[np.float32], placed: dict[str, Any], colormap: Any) -> None:
-        # Left to itself, napari takes the limits of the first image, which of a network is nearly even.
-        more: dict[str, Any] = {"contrast_limits": COLOUR_LIMITS} if self.placement.rgb else {"colormap": colormap}
-        low, high = limits_of(data)
-        if high > low and not self.placement.rgb:
-            more["contrast_limits"] = (low, high)
-        if self.placement.channels:
-            more["blending"] = "additive"
-        self._insert(kind, Image(data, rgb=self.placement.rgb, **placed, **more))
-        if kind in self._layers and not self.placement.rgb:
-            self._limits[kind] = tuple(self._layers[kind].contrast_limits)
 
     def _fit_contrast(self, kind: str, layer: Image, data: NDArray[np.float32]) -> None:
         """Follow the image with the contrast, until the user takes it in hand."""
@@ -220,10 +210,13 @@ class RunLayers:
         layer.name = f"{self._name}: {kind}"
         layer.metadata = self._metadata()
         self._layers[kind] = layer
+        self._add(layer, len(self._viewer.layers) if at is None else at)
+
+    def _add(self, layer: Layer, at: int) -> None:
+        """Add a layer to the viewer; what the user works on stays selected."""
         layers = self._viewer.layers
         chosen = set(layers.selection)
-        layers.insert(len(layers) if at is None else at, layer)
-        # What the user works on stays selected.
+        layers.insert(at, layer)
         layers.selection = chosen or {layer}
 
     def _metadata(self, more: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -231,6 +224,20 @@ class RunLayers:
 
     def _has(self, layer: Layer) -> bool:
         return layer in self._viewer.layers
+
+
+def image_layer(data: NDArray[np.float32], axes: str, placement: Placement, canvas: "Canvas", number: int = 0) -> Image:
+    """Make the layer of an image, or of one of its parts, as `Placement.parts` returns them."""
+    more: dict[str, Any] = {"colormap": placement.colormaps[number]}
+    # Left to itself, napari takes the limits of the first image, which of a network is nearly even.
+    low, high = limits_of(data)
+    if placement.rgb:
+        more = {"contrast_limits": COLOUR_LIMITS}
+    elif high > low:
+        more["contrast_limits"] = (low, high)
+    if placement.channels:
+        more["blending"] = "additive"
+    return Image(data, rgb=placement.rgb, **placement.on_canvas(axes, canvas), **more)
 
 
 def _is_image(name: str) -> bool:

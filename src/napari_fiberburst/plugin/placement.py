@@ -98,6 +98,17 @@ class Placement:
                 ordered = np.broadcast_to(np.expand_dims(ordered, position), shape)
         return ordered, wanted
 
+    def parts(self, image: NDArray[np.float32], acquisition: Acquisition) -> list[tuple[str, NDArray[np.float32], str]]:
+        """Return kind, data and axes of each layer that an image in intensity units, (H, W) or (H, W, C), takes."""
+        if self.channels:
+            return [
+                (f"image of {name}", *self.arrange(image[..., number], "YX"))
+                for number, name in enumerate(self.channels)
+            ]
+        if self.rgb:
+            return [("image", as_colour(image, acquisition), "YX")]
+        return [("image", *self.arrange(image, "YXC"[: image.ndim]))]
+
     def on_canvas(self, axes: str, canvas: Canvas | None = None) -> dict[str, Any]:
         """Return napari's scale, translate, units and axis labels for an array with these axes.
 

@@ -40,7 +40,9 @@ class Column(QScrollArea):
         content, bar = self.widget(), self.verticalScrollBar()
         if content is None or bar is None:
             return super().minimumSizeHint()
-        return QSize(content.minimumSizeHint().width() + bar.sizeHint().width(), super().minimumSizeHint().height())
+        # The viewer's style gives even this one a frame.
+        around = bar.sizeHint().width() + 2 * self.frameWidth()
+        return QSize(content.minimumSizeHint().width() + around, super().minimumSizeHint().height())
 
     def eventFilter(self, watched: Any, event: Any) -> bool:
         """Ask anew when what is in it has changed."""

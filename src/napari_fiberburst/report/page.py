@@ -5,7 +5,6 @@ from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.picture import as_picture, limits_of
 from napari_fiberburst.io.results import check_place, versions, write_whole
 from napari_fiberburst.quality.resolution import THRESHOLD
+from napari_fiberburst.report.facts import extent_of, field_of, in_words, number_used, scale_of
 from napari_fiberburst.report.figures import Chart, path_of, picture
 from napari_fiberburst.results.reconstruction import Reconstruction
 
@@ -119,20 +119,24 @@ def _verdict(result: Reconstruction) -> str:
 def _before_and_after(result: Reconstruction, burst: Burst) -> str:
     _, height, width, _ = result.acquisition.shape
     frame = burst.frames[result.reference]
-    before = picture(as_picture(frame), "a captured frame", width=width, height=height, **_scale(result))
-    across = _extent(result)
-    after = picture(as_picture(result.image), "the reconstruction", width=across[0], height=across[1], **_scale(result))
+    before = picture(as_picture(frame), "a captured frame", width=width, height=height, **scale_of(result))
+    across = extent_of(result)
+    after = picture(
+        as_picture(result.image), "the reconstruction", width=across[0], height=across[1], **scale_of(result)
+    )
     return (
         "<h2>Before and after</h2>\n<div class='row'>"
         f"{_figure(before, 'Captured', f'frame {result.reference} of {len(burst.frames)}')}"
-        f"{_figure(after, 'Reconstructed', f'from {_used(result)} frames')}</div>\n"
+        f"{_figure(after, 'Reconstructed', f'from {number_used(result)} frames')}</div>\n"
     )
 
 
 def _facts(result: Reconstruction) -> str:
-    rows: list[tuple[str, str]] = [("frames used", f"{_used(result)} of {len(result.homographies)}{_left_out(result)}")]
+    rows: list[tuple[str, str]] = [
+        ("frames used", f"{number_used(result)} of {len(result.homographies)}{_left_out(result)}")
+    ]
     if result.resolution is not None:
-        rows.append(("resolution, by two halves of the burst", _length(result, result.resolution)))
+        rows.append(("resolution, by two halves of the burst", in_words(result, result.resolution)))
     if result.held_out_rmse is not None:
         rows.append(("samples left out are missed by", f"{result.held_out_rmse:.3g} of {_span(result):g}"))
     if result.misfit is not None:
@@ -150,7 +154,7 @@ def _facts(result: Reconstruction) -> str:
         rows.append(("samples that show something else", f"{result.outliers.sum()} of {result.outliers.size}"))
     if result.bundle is not None and result.bundle.is_resolved:
         bundle = result.bundle
-        cores = f"{len(bundle.centres)} cores, {_length(result, bundle.pitch)} apart; {len(bundle.dead)} dead"
+        cores = f"{len(bundle.centres)} cores, {in_words(result, bundle.pitch)} apart; {len(bundle.dead)} dead"
         rows.append(("bundle", cores))
     rows.append(("motion", result.settings.method.motion.name))
     return f"<h2>What the image rests on</h2>\n{_table(rows)}\n"
@@ -170,7 +174,7 @@ def _agreement(result: Reconstruction) -> str:
     chart = Chart("agreement of halves", "cycles per pixel", "correlation", (0, limit), (min(0, correlation.min()), 1))
     chart.mark_y(THRESHOLD, "1/7")
     if result.resolution is not None and 1 / result.resolution <= limit:
-        chart.mark_x(1 / result.resolution, _length(result, result.resolution))
+        chart.mark_x(1 / result.resolution, in_words(result, result.resolution))
     chart.line(frequency, correlation)
     return _figure(chart.svg(), told, "Fourier ring correlation of two halves of the burst; finer than 1/7 is noise")
 
@@ -191,7 +195,7 @@ def _way(result: Reconstruction) -> str:
     _, height, width, _ = result.acquisition.shape
     usable = [frame for frame, matrix in enumerate(result.homographies) if np.isfinite(matrix).all()]
     middle = np.array([[(width - 1) / 2, (height - 1) / 2]])
-    pixel, unit = _scale(result).values()
+    pixel, unit = scale_of(result).values()
     points = [(transform_points(result.homographies[frame], middle) - middle)[0] * pixel for frame in usable]
     caption = f"where the middle of each frame lies in frame {result.reference}; the ring is the first frame used"
     return _figure(path_of(np.array(points), usable, unit), told, caption)
@@ -212,10 +216,10 @@ def _errors(result: Reconstruction) -> str:
 
 
 def _maps(result: Reconstruction) -> str:
-    shown = [_map(result, "Coverage", result.coverage, "samples to a pixel", _extent(result))]
+    shown = [_map(result, "Coverage", result.coverage, "samples to a pixel", extent_of(result))]
     uncertainty = None if result.uncertainty is None else np.where(_empty(result), np.nan, result.uncertainty)
-    shown.append(_map(result, "Uncertainty", uncertainty, "intensity", _extent(result)))
-    shown.append(_map(result, "Residual of each core", _residual_map(result), "intensity", _field(result)))
+    shown.append(_map(result, "Uncertainty", uncertainty, "intensity", extent_of(result)))
+    shown.append(_map(result, "Residual of each core", _residual_map(result), "intensity", field_of(result)))
     found = "".join(entry for entry in shown if entry)
     return f"<h2>Maps</h2>\n<div class='row small'>{found}</div>\n" if found else ""
 
@@ -226,7 +230,7 @@ def _map(
     if values is None:
         return ""
     low, high = limits_of(values)
-    drawn = picture(as_picture(values, (low, high)), title, width=extent[0], height=extent[1], **_scale(result))
+    drawn = picture(as_picture(values, (low, high)), title, width=extent[0], height=extent[1], **scale_of(result))
     return _figure(drawn, title, f"{what}, from {low:.3g} (black) to {high:.3g} (white)")
 
 
@@ -304,10 +308,6 @@ def _version(package: str) -> str:
     return str(versions()["versions"].get(package, ""))
 
 
-def _used(result: Reconstruction) -> int:
-    return len(result.homographies if result.frames_used is None else result.frames_used)
-
-
 def _left_out(result: Reconstruction) -> str:
     if result.frames_used is None:
         return ""
@@ -319,28 +319,6 @@ def _empty(result: Reconstruction) -> NDArray[np.bool_]:
     """Return where the image has nothing, (H, W)."""
     empty: NDArray[np.bool_] = np.any(np.isnan(result.image.reshape(*result.canvas.shape, -1)), axis=2)
     return empty
-
-
-def _field(result: Reconstruction) -> tuple[float, float]:
-    return float(result.acquisition.shape[2]), float(result.acquisition.shape[1])
-
-
-def _extent(result: Reconstruction) -> tuple[float, float]:
-    """Return how many pixels of a frame the image covers, (width, height)."""
-    height, width = result.canvas.shape
-    matrix = result.canvas.reference_from_image
-    return width * float(matrix[0, 0]), height * float(matrix[1, 1])
-
-
-def _scale(result: Reconstruction) -> dict[str, Any]:
-    """Return the width of a frame pixel and its unit; pixels where they are not known."""
-    size, unit = result.acquisition.pixel_size, result.acquisition.unit
-    return {"pixel": 1.0, "unit": "px"} if size is None or unit is None else {"pixel": size[1], "unit": unit}
-
-
-def _length(result: Reconstruction, pixels: float) -> str:
-    pixel, unit = _scale(result).values()
-    return f"{pixels:.1f} px" if unit == "px" else f"{pixels:.1f} px = {pixels * pixel:.3g} {unit}"
 
 
 def _span(result: Reconstruction) -> float:

@@ -23,11 +23,12 @@ from napari_fiberburst.plugin.display import AnimationThrottle, Display
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
+from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.preferences import preferences, remember, remembered, usual
 from napari_fiberburst.plugin.runner import Runner, wait_for_workers
-from napari_fiberburst.plugin.runs import KeptRun, RunsPanel
+from napari_fiberburst.plugin.runs import RunsPanel
 from napari_fiberburst.plugin.sections import row_of, section
 from napari_fiberburst.plugin.tasks.task import Task
 from napari_fiberburst.settings import SplineMethod, choose
@@ -54,7 +55,7 @@ class PictureTask(Task):
         self._is_network = False
         self.form = SettingsForm()
         self.runner = Runner(self)
-        self.runs = RunsPanel()
+        self.runs = RunsPanel(viewer)
         self.display = Display(viewer, self)
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
@@ -108,6 +109,7 @@ class PictureTask(Task):
 
     def shut_down(self) -> None:
         """Stop what is running and let go of the viewer. May be called more than once."""
+        self.runs.compare.stop()
         _let_go(self.runner, self.display, self._throttle)
         self._follow_state("ready")
 
@@ -300,6 +302,7 @@ class PictureTask(Task):
         self.form.changed.connect(self._estimate)
         self.form.turned_live.connect(self._turn_live)
         self.runs.chosen.connect(self.display.select)
+        self.runs.charted.connect(self.display.chart)
         self.runs.removed.connect(self._forget)
         self.runs.continue_asked.connect(self.continue_run)
         self.runner.reported.connect(self._show)

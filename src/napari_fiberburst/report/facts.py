@@ -1,0 +1,34 @@
+"""What pages and figures say of a result: which frames, which sizes, in which unit."""
+
+from typing import Any
+
+from napari_fiberburst.results.reconstruction import Reconstruction
+
+
+def number_used(result: Reconstruction) -> int:
+    """Return how many frames the image rests on."""
+    return len(result.homographies if result.frames_used is None else result.frames_used)
+
+
+def field_of(result: Reconstruction) -> tuple[float, float]:
+    """Return the size of a frame in pixels, (width, height)."""
+    return float(result.acquisition.shape[2]), float(result.acquisition.shape[1])
+
+
+def extent_of(result: Reconstruction) -> tuple[float, float]:
+    """Return how many pixels of a frame the image covers, (width, height)."""
+    height, width = result.canvas.shape
+    matrix = result.canvas.reference_from_image
+    return width * float(matrix[0, 0]), height * float(matrix[1, 1])
+
+
+def scale_of(result: Reconstruction) -> dict[str, Any]:
+    """Return the width of a frame pixel and its unit; pixels where they are not known."""
+    size, unit = result.acquisition.pixel_size, result.acquisition.unit
+    return {"pixel": 1.0, "unit": "px"} if size is None or unit is None else {"pixel": size[1], "unit": unit}
+
+
+def in_words(result: Reconstruction, pixels: float) -> str:
+    """Return a length in frame pixels and, where it is known, in the unit of the burst."""
+    pixel, unit = scale_of(result).values()
+    return f"{pixels:.1f} px" if unit == "px" else f"{pixels:.1f} px = {pixels * pixel:.3g} {unit}"
