@@ -17,8 +17,8 @@ from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.training import BehindBundle, Problem, State
 from napari_fiberburst.pipeline.diagnose import diagnose
+from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.spline import SplineFit
-from napari_fiberburst.pipeline.stages import Fitted
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
 from napari_fiberburst.settings import Fourier, NetworkMethod, PublishedMethod, Settings, TrainedMethod

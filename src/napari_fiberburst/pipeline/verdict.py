@@ -223,7 +223,7 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     gains_known : bool
         Whether the cores' gains were known before, so that motion need not tell them.
     """
-    used, count = int(registration.used.sum()), len(registration.used)
+    used, count = int(registration.used.sum()), len(registration.used) - len(registration.left_out)
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.
