@@ -75,8 +75,8 @@ class SplineFit:
     def result(self, ending: Ending, seconds: float) -> Reconstruction:
         """Return the reconstruction."""
         again = None
-        if ending == "finished" and self._aligned is not None and self.fitted.draft is not None:
-            again = Again(self._order, self._aligned, self.fitted.draft, self._losses, seconds)
+        if ending == "finished" and self._aligned is not None:
+            again = Again(self._order, self._aligned, self.fitted, self._losses, seconds)
         return self._order.outcome(self.fitted, self._losses, ending, seconds, again)
 
     def _watched(self, stages: Generator[Fitted | None, None, Fitted]) -> Generator[Snapshot | None, None, Fitted]:
