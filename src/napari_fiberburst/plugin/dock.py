@@ -356,6 +356,7 @@ class FiberBurstWidget(QWidget):
         self.runner.failed.connect(self._fail)
         self.runner.state_changed.connect(self._follow_state)
         self.display.complete.connect(self._show_what_was_asked)
+        self.display.card.steering.changed.connect(self.runs.refresh)
         # The window can go without a word to this widget; what is called then must not need it.
         self.destroyed.connect(partial(_let_go, self.runner, self.display, self._throttle))
 

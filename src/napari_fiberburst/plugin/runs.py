@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
     from napari_fiberburst.results.reconstruction import Reconstruction
 
-_LINES_OF_RUNS = 4
+_LINES_OF_RUNS = 3
 _MORE_STEPS = 200
 _NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
 # What a row tells of a run, and in more words.
@@ -63,7 +63,7 @@ class KeptRun:
     source : BurstSource
         The burst.
     choices : dict
-        What `reconstruct` was given by name.
+        What `reconstruct` was given by name, or would be to come to the result as it was turned since.
     layers : RunLayers
         In the viewer.
     history : History
@@ -75,7 +75,7 @@ class KeptRun:
     turned_live : list of (float, str, object)
         Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
-        Once it has ended.
+        Once it has ended, and while it is not being turned.
     scores : Scores or None
         The last ones, where the truth is known.
     """
