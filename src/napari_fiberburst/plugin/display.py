@@ -49,6 +49,7 @@ class Display(QObject):
         super().__init__(parent)
         self.status = QLabel(_NOTHING_YET)
         self.status.setWordWrap(True)
+        self.status.setToolTip("While a network learns: a rectangle drawn in a Shapes layer is learned first.")
         self.bar = QProgressBar()
         self.slider = QLabeledSlider()
         self._curves = Curves(viewer)

@@ -27,6 +27,7 @@ from napari_fiberburst.plugin.copying import CopyButtons
 from napari_fiberburst.plugin.departures import Departures
 from napari_fiberburst.plugin.display import AnimationThrottle, Display
 from napari_fiberburst.plugin.empty import EmptyBox
+from napari_fiberburst.plugin.favouring import RegionWatch
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     import napari
     from napari.layers import Layer
 
+    from napari_fiberburst.control import Region
     from napari_fiberburst.results.progress import Progress
 
 _WIDTH = 350
@@ -73,6 +75,7 @@ class FiberBurstWidget(QWidget):
         self.runner = Runner(self)
         self.runs = RunsPanel()
         self.display = Display(viewer, self)
+        self._regions = RegionWatch(viewer, self._favour)
         self.start_button = QPushButton("Start")
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
@@ -173,6 +176,8 @@ class FiberBurstWidget(QWidget):
         self.display.begin()
         self.runs.add(self._run)
         self.runner.start(job, f"{name} of {source.name}")
+        if self._is_network:
+            self._regions.begin(source)
 
     def _show(self, report: "Progress") -> None:
         job, run = self.runner.job, self._run
@@ -222,6 +227,7 @@ class FiberBurstWidget(QWidget):
         """Offer what can be done now."""
         is_ready = state == "ready"
         if is_ready:
+            self._regions.end()
             self._throttle.restore()
         else:
             self._throttle.slow(self.window() or self)
@@ -259,9 +265,15 @@ class FiberBurstWidget(QWidget):
         except SettingsError as error:
             show_error(str(error))
             return
-        seconds = job.curve[-1].seconds if job.curve else 0.0
-        run.turned_live.append((seconds, name, value))
-        run.layers.tell("turned_live", list(run.turned_live))
+        run.note_turned(name, value)
+
+    def _favour(self, region: "Region | None") -> None:
+        """Let the running fit learn a region first that was drawn just now."""
+        job, run = self.runner.job, self._run
+        if job is not None and run is not None:
+            job.control.region = region
+            run.note_turned("region", region)
+            self.display.status.setText("the region drawn is learned first" if region else "no region is favoured")
 
     def _take_input(self) -> None:
         if self.input.burst.value is not self._burst:

@@ -128,6 +128,11 @@ class KeptRun:
         error = "" if result.held_out_rmse is None else float(f"{result.held_out_rmse:.3g}")
         return self.name, method, round(result.seconds, 1), result.quality or "", error
 
+    def note_turned(self, name: str, value: Any) -> None:
+        """Note what was changed while it runs."""
+        self.turned_live.append((self.curve[-1].seconds if self.curve else 0.0, name, value))
+        self.layers.tell("turned_live", list(self.turned_live))
+
     @property
     def has_bundle(self) -> bool:
         """Whether there is a bundle to keep."""
