@@ -23,8 +23,9 @@ from napari_fiberburst import Burst, Progress, reconstruct
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.pipeline.diagnose import diagnose
+from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.reconstruct import iterate
-from napari_fiberburst.pipeline.stages import Fitted, Stages
+from napari_fiberburst.pipeline.stages import Stages
 from napari_fiberburst.settings import SplineMethod, choose
 
 Step = TypeVar("Step")

@@ -23,7 +23,7 @@ def found(burst, monkeypatch):
         kept.append(args[3])
         return diagnose(*args, **kwargs)
 
-    monkeypatch.setattr("napari_fiberburst.pipeline.spline.diagnose", keep)
+    monkeypatch.setattr("napari_fiberburst.pipeline.outcome.diagnose", keep)
     return reconstruct(burst), kept[0].smear
 
 

@@ -47,7 +47,7 @@ def add_parameter(parser: Any, parameter: Parameter, owner: str = "") -> None:
     `owner` names the choices that the parameter belongs to.
     """
     value = f"{parameter.default:g}" if isinstance(parameter.default, float) else parameter.default
-    default = "" if value is None else f"default {value}"
+    default = "" if value in (None, ()) else f"default {value}"
     remarks = "; ".join(filter(None, [owner and f"{owner} only", default]))
     text = f"{parameter.doc} ({remarks})" if remarks else parameter.doc
     if parameter.kind is bool:
@@ -55,6 +55,9 @@ def add_parameter(parser: Any, parameter: Parameter, owner: str = "") -> None:
         return
     if parameter.choices:
         parser.add_argument(f"--{parameter.name.replace('_', '-')}", choices=parameter.choices, help=text)
+        return
+    if parameter.kind is tuple:
+        parser.add_argument(f"--{parameter.name.replace('_', '-')}", nargs="+", type=int, metavar="FRAME", help=text)
         return
     parser.add_argument(
         f"--{parameter.name.replace('_', '-')}", type=parameter.kind, metavar=parameter.kind.__name__.upper(), help=text

@@ -1,5 +1,6 @@
 """Where the frames of a burst look: what a registration is."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import relative_to, transform_points
+from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.motion.displacement import Displacement
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators.grid import Grid
@@ -82,6 +84,8 @@ class Registration(Stored):
         How frames bend beyond their homographies; None where they were not asked to.
     dof : int
         Degrees of freedom of each frame's transform: 0, 2 (translation), 4 (similarity), 6 (affine), 8 (homography).
+    left_out : tuple of int
+        Frames that were registered, and take no part because a user has left them out.
     """
 
     _kind: ClassVar[str] = "registration"
@@ -103,6 +107,7 @@ class Registration(Stored):
     scene: GreyScene | None = field(default=None, repr=False)
     displacement: Displacement | None = field(default=None, repr=False)
     dof: int = 8
+    left_out: tuple[int, ...] = ()
 
     @classmethod
     def known(cls, scene_from_frame: NDArray[np.float64], shape: tuple[int, int], cores: int) -> "Registration":
@@ -120,24 +125,56 @@ class Registration(Stored):
         )
 
     @property
+    def registered(self) -> NDArray[np.bool_]:
+        """(T,) bool, frames whose place is known: those that take part, and those that a user has left out."""
+        registered = self.used.copy()
+        registered[list(self.left_out)] = True
+        return registered
+
+    @property
     def reference(self) -> int:
-        """The first frame that takes part: images and homographies are in its pixels."""
-        return int(np.flatnonzero(self.used)[0])
+        """The first registered frame: images and homographies are in its pixels, also where it was left out."""
+        return int(np.flatnonzero(self.registered)[0])
 
     @property
     def reference_from_frame(self) -> NDArray[np.float64]:
-        """(T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are left out."""
+        """(T, 3, 3), frame-t pixel to the reference frame's pixel; NaN for frames that are not registered."""
         relative = relative_to(self.scene_from_frame, self.reference)
-        relative[~self.used] = np.nan
+        relative[~self.registered] = np.nan
         return relative
 
+    def without(self, frames: Collection[int]) -> "Registration":
+        """Return the registration with these frames left out: they lie where they lay, and count for nothing.
+
+        Raises
+        ------
+        SettingsError
+            There is no such frame, or none would take part any more.
+        """
+        count = len(self.used)
+        if unknown := [frame for frame in frames if not 0 <= frame < count]:
+            raise SettingsError(
+                f"frames to leave out must be numbers from 0 to {count - 1}, as the burst has them; got {unknown}"
+            )
+        gone = np.zeros(count, dtype=bool)
+        gone[list(frames)] = True
+        gone &= self.used
+        if not (self.used & ~gone).any():
+            raise SettingsError("at least one registered frame must take part; leave fewer frames out")
+        return replace(
+            self,
+            used=self.used & ~gone,
+            frame_weights=np.where(gone, 0, self.frame_weights).astype(np.float32),
+            left_out=tuple(sorted({*self.left_out, *np.flatnonzero(gone).tolist()})),
+        )
+
     def points(self, positions: Tensor) -> Tensor:
-        """Return where places (N, 2) of every frame lie in the reference frame's pixels, (T, N, 2); NaN if left out."""
+        """Return where places (N, 2) of every frame lie in the reference frame's pixels, (T, N, 2); NaN if unknown."""
         if self.displacement is None:
             points: Tensor = transform_points(torch.from_numpy(self.reference_from_frame).to(positions), positions)
             return points
         points = self.motion.to_reference(self.motion.apply(positions), self.reference)
-        return torch.where(torch.from_numpy(self.used).to(points.device)[:, None, None], points, torch.nan)
+        return torch.where(torch.from_numpy(self.registered).to(points.device)[:, None, None], points, torch.nan)
 
     @property
     def motion(self) -> FrameMotion:

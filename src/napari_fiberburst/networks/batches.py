@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
-from napari_fiberburst.coordinates import unit_from_pixel
+from napari_fiberburst.control import Region
+from napari_fiberburst.coordinates import transform_points, unit_from_pixel
 from napari_fiberburst.data.burst import Burst
 
 # Spreads the seeds of consecutive epochs, so that seed 0, epoch 1 is not seed 1, epoch 0.
@@ -22,6 +23,8 @@ _SEED_STRIDE = 1_000_003
 _RING = math.sqrt(7 / 12)
 # So many of the samples that are left out tell their error well enough.
 _MOST_HELD_OUT = 8192
+# So many samples of a region that is favoured are drawn to each that is drawn anyhow.
+_FAVOURED = 0.5
 
 
 class Batch(NamedTuple):
@@ -47,6 +50,39 @@ class Batch(NamedTuple):
     frames: Tensor
     intensities: Tensor
     weights: Tensor | None = None
+
+
+class _Favoured:
+    """Samples of a region, which are drawn beside those of a stream.
+
+    Parameters
+    ----------
+    indices : Tensor
+        (N,) int64, numbers of the samples.
+    seed : int
+        Of the order in which they come.
+    """
+
+    def __init__(self, indices: Tensor, seed: int) -> None:
+        self._indices = indices
+        self._generator = torch.Generator(indices.device).manual_seed(seed)
+
+    def beside(self, indices: Tensor) -> Tensor:
+        """Return a stream's indices, and some of the region's."""
+        count = round(_FAVOURED * len(indices))
+        shape = (count,)
+        drawn = torch.randint(len(self._indices), shape, generator=self._generator, device=self._indices.device)
+        return torch.cat([indices, self._indices[drawn]])
+
+
+def _inside(region: Region, places: Tensor, homographies: NDArray[np.float64]) -> Tensor:
+    """Return which places (N, 2) lie in a region of frame 0, for each frame (T, N), by (T, 3, 3) to its pixels."""
+    x0, y0, x1, y1 = region
+    found = []
+    for matrix in torch.from_numpy(homographies).to(places):
+        x, y = transform_points(matrix, places).unbind(dim=1)
+        found.append((x >= x0) & (x < x1) & (y >= y0) & (y < y1))  # NaN is outside
+    return torch.stack(found)
 
 
 class PixelStream:
@@ -75,11 +111,24 @@ class PixelStream:
         self._seed = seed
         self._epoch = -1
         self._order = torch.empty(0, dtype=torch.int64)
+        self._favoured: _Favoured | None = None
         self.drawn = drawn
+
+    def favour(self, region: Region | None, homographies: NDArray[np.float64]) -> None:
+        """Draw more samples of a region of frame 0, by where the frames (T, 3, 3) lie in its pixels; None of none."""
+        self._favoured = None
+        if region is None:
+            return
+        x, y = torch.meshgrid(torch.arange(self._width), torch.arange(self._height), indexing="xy")
+        places = torch.stack([x, y], dim=-1).reshape(-1, 2).to(self._device, torch.float32)
+        inside = _inside(region, places, homographies).reshape(-1).nonzero()[:, 0]
+        self._favoured = _Favoured(inside, self._seed) if len(inside) else None
 
     def draw(self, count: int) -> Batch:
         """Return the next `count` samples of the stream."""
         indices = torch.cat(list(self._next_indices(count)))
+        if self._favoured is not None:
+            indices = self._favoured.beside(indices)
         frames = indices // self._frame_size
         within = indices % self._frame_size
         x = (2 * (within % self._width) + 1) / self._width - 1
@@ -145,8 +194,19 @@ class BundleStream:
         self._seed = seed
         self._epoch = -1
         self._order = self._kept
+        self._favoured: _Favoured | None = None
+        self._positions = samples.positions
         self.count = len(self._kept)
         self.drawn = 0
+
+    def favour(self, region: Region | None, homographies: NDArray[np.float64]) -> None:
+        """Draw more samples of a region of frame 0, by where the frames (T, 3, 3) lie in its pixels; None of none."""
+        self._favoured = None
+        if region is None:
+            return
+        inside = _inside(region, self._positions, homographies).reshape(-1)
+        kept = self._kept[inside[self._kept]]
+        self._favoured = _Favoured(kept, self._seed) if len(kept) else None
 
     def draw(self, count: int) -> Batch:
         """Return the next `count` samples of the stream."""
@@ -160,7 +220,8 @@ class BundleStream:
             self.drawn += len(part)
             count -= len(part)
             parts.append(part)
-        return self._batch(torch.cat(parts))
+        indices = torch.cat(parts)
+        return self._batch(indices if self._favoured is None else self._favoured.beside(indices))
 
     def left_out(self) -> Batch | None:
         """Return samples that are never drawn; None where there are none."""

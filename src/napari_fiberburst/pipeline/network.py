@@ -1,6 +1,7 @@
 """Networks at work: steps of Adam, the states a run can go back to, and when it has learned enough."""
 
 import logging
+import math
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,14 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.control import Control
+from napari_fiberburst.control import Control, Region
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.training import BehindBundle, Problem, State
 from napari_fiberburst.pipeline.diagnose import diagnose
+from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.spline import SplineFit
-from napari_fiberburst.pipeline.stages import Fitted
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
 from napari_fiberburst.settings import Fourier, NetworkMethod, PublishedMethod, Settings, TrainedMethod
@@ -33,6 +34,8 @@ _STEPS_BETWEEN_EVALUATIONS = 10
 # Early stopping: a fit without an end of its own ends once the error of held-out samples has not improved for this
 # part of its steps.
 _PATIENCE, _LEAST_PATIENCE = 0.4, 150
+# A region is favoured for this part of the steps; then all is learned alike again, and the rest does not stay behind.
+_FAVOURED_PART = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,6 +176,8 @@ class Training:
         self._kept: tuple[_Kept, ...] = (_Kept(0, self._method, self._problem.state()),)
         self._kept_at = 0.0
         self._live_sigma: float | None = None
+        self._live_region: Region | None = None
+        self._favoured_until = 0.0
         self._image: NDArray[np.float32] | None = None
         self._step = 0
 
@@ -254,7 +259,14 @@ class Training:
 
     def _follow(self) -> None:
         """Take over what a user has changed since the last step."""
-        rate, sigma = self._control.learning_rate, self._control.sigma
+        rate, sigma, region = self._control.learning_rate, self._control.sigma, self._control.region
+        if region != self._live_region:
+            self._live_region = region
+            self._favoured_until = self._step + _FAVOURED_PART * self._iterations
+            self._problem.samples.favour(region, self._representation().homographies())
+        elif region is not None and self._step > self._favoured_until:
+            self._problem.samples.favour(None, self._representation().homographies())
+            self._favoured_until = math.inf
         if rate is not None and rate != self._method.learning_rate:
             self._problem.set_learning_rate(rate)
             self._method = replace(self._method, learning_rate=rate)

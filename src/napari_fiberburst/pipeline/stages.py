@@ -7,7 +7,7 @@ it can stop between any two steps and still have something to draw.
 import logging
 import math
 from collections.abc import Generator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -21,84 +21,28 @@ from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import Samples, in_grey, only_exposed, sample_cores, sample_pixels, shows_detail
 from napari_fiberburst.data.burst import Acquisition, Burst
-from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.motion.places import places_with_gains, split_by_place, with_common_gains, with_gains_by_place
 from napari_fiberburst.motion.register import refining, registering
 from napari_fiberburst.motion.registration import Registration, unregistered
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
-from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.remeasure import lit, remeasured
-from napari_fiberburst.pipeline.render import image_of
-from napari_fiberburst.scene.image import SplineImage
+from napari_fiberburst.pipeline.scenes import Scenes
 from napari_fiberburst.scene.offsets import find_offsets
 from napari_fiberburst.scene.outliers import find_outliers
 from napari_fiberburst.scene.shading import find_shading, shading_of_frames
-from napari_fiberburst.scene.solve import Scene, grid_over, prediction_error, solve_quickly, solving
+from napari_fiberburst.scene.solve import prediction_error
 from napari_fiberburst.settings import SplineMethod
 
 logger = logging.getLogger(__name__)
 
-# Spacing of the first preview's nodes, pixels or, in coarse bundles, pitches.
-_PREVIEW_SPACING, _PREVIEW_PITCHES = 1.5, 0.3
 # In pitches: where an object travels less (root mean square), registration starts from two places.
 _SHORT_TRAVEL = 0.7
-# A union of frames reaches at most so many frames' sizes from the reference frame.
-_MOST_FIELDS = 5
 # Corrections of given gains (root mean square) that are worth a note, and that no bundle needs that was measured well.
 _LARGE_CORRECTION, _ANOTHER_BUNDLE = 0.03, 0.12
 # Part of a normal distribution that lies within one standard deviation.
 _WITHIN_ONE_SIGMA = 0.683
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fitted:
-    """What is known of a burst at one moment of its fit.
-
-    Attributes
-    ----------
-    bundle : Bundle
-        That samples are taken with; what gains are found beyond it is in the registration.
-    registration : Registration
-        Of the frames, with the bundle at rest.
-    canvas : Canvas
-        Where the image lies.
-    mount : Mount or None
-        Where the bundle is in the frames as they were recorded; None where it rests.
-    samples : Samples or None
-        The final samples, in all channels, as they were taken; None until it is known what a sample is.
-    scene : Scene or None
-        The latest solution.
-    image : SplineImage or None
-        The latest image; it knows by itself how the frames lay when it was made.
-    notes : tuple of str
-        What a user should know, beside the notes of the registration.
-    noise : Noise or None
-        Of the camera; None where it cannot be told, or not yet.
-    outliers : Tensor or None
-        (T, G) bool, cores that were seen to show something else before the scene was solved; None if none were.
-    """
-
-    bundle: Bundle
-    registration: Registration
-    canvas: Canvas
-    mount: Mount | None = None
-    samples: Samples | None = None
-    scene: Scene | None = None
-    image: SplineImage | None = None
-    notes: tuple[str, ...] = ()
-    noise: Noise | None = None
-    outliers: Tensor | None = None
-
-    @property
-    def recorded(self) -> Registration:
-        """The registration of the frames as they were recorded."""
-        return self.registration if self.mount is None else self.registration.as_recorded(self.mount.offsets)
-
-    @property
-    def all_notes(self) -> tuple[str, ...]:
-        """All that a user should know before trusting the image."""
-        return (*self.notes, *self.registration.notes)
 
 
 class Stages:
@@ -133,6 +77,7 @@ class Stages:
                 "one (time, height, width) stack"
             )
         self._burst, self._method, self._seed, self._given = burst, method, seed, given
+        self._scenes = Scenes(burst.acquisition, method, seed)
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = in_grey(self._frames)
         self._marks = find_marks(only_exposed(self._grey))
@@ -170,7 +115,7 @@ class Stages:
         fitted = Fitted(
             bundle=bundle,
             registration=unregistered(samples),
-            canvas=self._frame_canvas(),
+            canvas=self._scenes.frame_canvas,
             mount=mount,
             notes=(*steadied, *notes),
         )
@@ -192,23 +137,7 @@ class Stages:
 
     def solve(self, fitted: Fitted) -> Generator[Fitted, None, Fitted]:
         """Solve the scene for the bundle and motion as they are."""
-        samples = self._in_colour(fitted)
-        fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
-        grid = self._grid(1 / self._method.upsample, fitted)
-        steps = solving(
-            samples,
-            fitted.registration,
-            grid,
-            smoothness=self._method.smoothness,
-            held_out=self._method.held_out,
-            seed=self._seed,
-        )
-        while True:
-            try:
-                fitted = self._with_scene(fitted, next(steps))
-                yield fitted
-            except StopIteration as end:
-                return self._with_scene(fitted, end.value)
+        return (yield from self._scenes.solve(replace(fitted, samples=self._in_colour(fitted))))
 
     def round_off(self, fitted: Fitted | None) -> Fitted:
         """Make bundle, samples, motion and image belong together, wherever the steps have ended."""
@@ -219,12 +148,13 @@ class Stages:
             fitted = Fitted(
                 bundle=bundle,
                 registration=unregistered(samples),
-                canvas=self._frame_canvas(),
+                canvas=self._scenes.frame_canvas,
                 notes=(_warned(text),),
             )
         elif fitted.registration.stage != "complete":
             text = "the run ended before the frames were registered"
             fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
+        fitted = self._scenes.without_left_out(fitted)
         return self._sketched(replace(fitted, samples=self._in_colour(fitted)))
 
     def _calibrate(self, mount: Mount | None) -> Generator[None, None, tuple[Bundle, tuple[str, ...]]]:
@@ -306,7 +236,7 @@ class Stages:
     def _error(self, fitted: Fitted) -> float:
         """Return by how much samples that are left out are missed, relative to their mean light."""
         samples = _seen(self._cores(fitted.bundle, self._grey[..., None]), fitted.mount)
-        grid = self._grid(max(_PREVIEW_SPACING, _PREVIEW_PITCHES * fitted.bundle.pitch), fitted)
+        grid = self._scenes.coarse_grid(fitted)
         return prediction_error(samples, fitted.registration, grid, seed=self._seed)
 
     def _with_equal_cores(self, fitted: Fitted) -> Fitted:
@@ -438,47 +368,13 @@ class Stages:
         chosen = slice(number, number + 1)
         shown = sample_cores(self._frames[chosen], fitted.bundle, self._burst)
         shown = replace(shown, weights=samples.weights[chosen])
-        grid = self._grid(self._spacing(fitted.bundle), fitted)
-        return self._with_scene(fitted, solve_quickly(shown, unregistered(shown), grid, self._method.smoothness))
+        return self._scenes.sketched(fitted, shown, unregistered(shown))
 
     def _sketched(self, fitted: Fitted) -> Fitted:
         """Solve a coarse image of all that is known so far."""
         samples = self._in_colour(fitted)
-        fitted = replace(fitted, canvas=self._canvas(fitted.registration, samples))
-        grid = self._grid(self._spacing(fitted.bundle), fitted)
-        return self._with_scene(fitted, solve_quickly(samples, fitted.registration, grid, self._method.smoothness))
-
-    def _spacing(self, bundle: Bundle) -> float:
-        """Return the spacing of a preview's nodes, pixels."""
-        return max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * bundle.pitch)
-
-    def _with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
-        """Return what is known with another scene, and the image that it stands for."""
-        if fitted.scene is not None and scene.coefficients is fitted.scene.coefficients:
-            return replace(fitted, scene=scene)
-        image = image_of(scene, fitted.recorded, fitted.bundle, self._burst, fill=self._method.fill)
-        return replace(fitted, scene=scene, image=image)
-
-    def _frame_canvas(self) -> Canvas:
-        return Canvas.over((0, 0, self._burst.shape[2], self._burst.shape[1]), self._method.upsample)
-
-    def _canvas(self, registration: Registration, samples: Samples) -> Canvas:
-        """Lay the canvas over the reference frame, or over all that any frame saw."""
-        if self._method.canvas == "frame":
-            return self._frame_canvas()
-        points = registration.points(samples.positions)[registration.correct(samples).weights > 0]
-        points = points[torch.isfinite(points).all(dim=1)]
-        low, high = points.amin(dim=0).floor().tolist(), points.amax(dim=0).ceil().tolist()
-        most = _MOST_FIELDS * max(self._burst.shape[1:3])
-        low, high = ([min(max(edge, -most), most) for edge in corner] for corner in (low, high))
-        return Canvas.over((low[0], low[1], high[0] + 1, high[1] + 1), self._method.upsample)
-
-    def _grid(self, spacing: float, fitted: Fitted) -> Grid:
-        """Return a grid over the canvas and some more, its nodes on pixel centres where the spacing is a pixel's."""
-        canvas = fitted.canvas
-        first = canvas.reference_from_image[:2, 2]
-        last = first + canvas.reference_from_image[[0, 1], [0, 1]] * (np.array(canvas.shape[::-1]) - 1)
-        return grid_over((*first.tolist(), *last.tolist()), spacing, fitted.bundle.pitch + fitted.bundle.radius)
+        fitted = replace(fitted, canvas=self._scenes.canvas(fitted.registration, samples))
+        return self._scenes.sketched(fitted, samples, fitted.registration)
 
 
 def _compared(fitted: Fitted, given: Bundle) -> Fitted:

@@ -233,8 +233,9 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     gains_known : bool
         Whether the cores' gains were known before, so that motion need not tell them.
     """
-    blank = np.isnan(registration.confidence) & ~registration.used
-    used, count = int(registration.used.sum()), int((~blank).sum())
+    shows = ~np.isnan(registration.confidence) | registration.used
+    shows[list(registration.left_out)] = False
+    used, count = int(registration.used.sum()), int(shows.sum())
     reasons: list[str] = []
     is_bad = False
     # A single look at the object has gaps that no sample left out can be predicted across.

@@ -72,6 +72,8 @@ def _option(name: str, value: object) -> list[str]:
     option = name.replace("_", "-")
     if isinstance(value, bool):
         return [f"--{option}" if value else f"--no-{option}"]
+    if isinstance(value, tuple):
+        return [f"--{option}", *map(str, value)]
     return [f"--{option}", str(value)]
 
 

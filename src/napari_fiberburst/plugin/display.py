@@ -50,6 +50,7 @@ class Display(QObject):
         super().__init__(parent)
         self.status = QLabel(_NOTHING_YET)
         self.status.setWordWrap(True)
+        self.status.setToolTip("While a network learns: a rectangle drawn in a Shapes layer is learned first.")
         self.bar = QProgressBar()
         self.slider = QLabeledSlider()
         self._curves = Curves(viewer)
@@ -161,7 +162,11 @@ class Display(QObject):
     def _scrub(self, index: int) -> None:
         """Show an image of the past."""
         run = self._selected
-        if run is not None and run.result is not None and index < len(run.history.entries):
+        if run is None or run.result is None or index >= len(run.history.entries):
+            return
+        if index == self.slider.maximum():  # the newest may have been turned since
+            run.layers.show_image(run.result.image, run.result.acquisition, run.result.canvas)
+        else:
             entry = run.history.entries[index]
             run.layers.show_image(entry.image, run.result.acquisition, entry.canvas)
 

@@ -115,6 +115,7 @@ class FiberBurstWidget(QWidget):
         is_empty = self.input.burst.value is None and all(task.is_empty for task in self.tasks)
         self.empty.setVisible(is_empty)
         self.filled.setVisible(not is_empty)
+        self.glance.set_brief(is_brief=not self.picture.is_empty)
 
     def _lay_out(self) -> None:
         for number, task in enumerate(self.tasks):

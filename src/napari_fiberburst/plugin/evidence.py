@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 # What there is, in the order it is offered.
 KINDS = {
-    "outlines": "Where each frame lies on the image; follows the slider.",
+    "outlines": "Where each frame lies on the image; follows the slider. Ctrl + click (Cmd on a Mac) inside one leaves "
+    "its frame out, or takes it in again; one that is left out is grey and thin.",
     "path": "The way of the frames' centres.",
     "coverage": "How many core samples saw each pixel; 0 is filled in from the surroundings.",
     "frames": "How many frames have seen each pixel.",
@@ -33,6 +34,8 @@ KINDS = {
 # Those that are known while a run goes: they follow from the motion alone.
 MOTION_KINDS = ("outlines", "path")
 _EDGE, _TRACK_COLOURS = "#ffb000", "turbo"
+# Of the outline of a frame that was left out, which is thinner too.
+_GREY, _THIN = "#909090", 0.5
 # Outlines of frames that bend have so many points a side; arrows that show how, so many along the frame's longer side,
 # and are so much longer than the way they show.
 _PER_SIDE, _ARROWS, _ENLARGED = 12, 16, 3.0
@@ -56,11 +59,14 @@ class Motion:
         Height and width of a frame.
     shift : callable or None
         Where frames bend: from a frame's pixels (N, 2) and its number to the way (N, 2) to their frame-0 pixels.
+    left_out : tuple of int
+        Frames that the image is made without.
     """
 
     homographies: NDArray[np.float64]
     shape: tuple[int, int]
     shift: Shift | None = None
+    left_out: tuple[int, ...] = ()
 
     @property
     def known(self) -> list[int]:
@@ -79,7 +85,8 @@ class Motion:
 def motion_of(result: "Reconstruction") -> Motion:
     """Return how the frames of a result lie on its image."""
     shift = (lambda points, frame: result.renderer.displacement(points[None], frame)[0]) if result.bends else None
-    return Motion(homographies=result.homographies, shape=result.acquisition.shape[1:3], shift=shift)
+    left_out = result.settings.flat().get("leave_out", ())
+    return Motion(homographies=result.homographies, shape=result.acquisition.shape[1:3], shift=shift, left_out=left_out)
 
 
 def kinds_of(result: "Reconstruction", placement: Placement) -> tuple[str, ...]:
@@ -111,6 +118,22 @@ def outlines(motion: Motion, placement: Placement) -> Any:
     return [one for frame in motion.known for one in placement.vertices(motion.moved(sides, frame), frame)]
 
 
+def outlined_frames(motion: Motion, placement: Placement) -> list[int]:
+    """Return the frame of each polygon of `outlines`."""
+    each = int(np.prod([placement.sizes[axis] for axis in placement.axes if axis not in "TYX"]))
+    return [frame for frame in motion.known for _ in range(each)]
+
+
+def outline_look(motion: Motion, placement: Placement) -> dict[str, Any]:
+    """Return colour and width of each outline: those of frames left out are grey and thin."""
+    usual = max(1.0, motion.shape[1] / _FRAME_PER_EDGE)
+    is_out = [frame in motion.left_out for frame in outlined_frames(motion, placement)]
+    return {
+        "edge_color": [_GREY if out else _EDGE for out in is_out],
+        "edge_width": [usual * (_THIN if out else 1.0) for out in is_out],
+    }
+
+
 def path(motion: Motion, placement: Placement) -> Any:
     """Return the frames' centres, as a Tracks layer takes them."""
     height, width = motion.shape
@@ -124,8 +147,8 @@ def motion_layer(kind: str, motion: Motion, placement: Placement) -> Layer:
     """Make the layer of outlines or of the path."""
     placed = placement.on_canvas(placement.axes)
     if kind == "outlines":
-        edge = {"edge_color": _EDGE, "edge_width": max(1.0, motion.shape[1] / _FRAME_PER_EDGE)}
-        return Shapes(outlines(motion, placement), shape_type="polygon", face_color="transparent", **edge, **placed)
+        look = {"shape_type": "polygon", "face_color": "transparent", **outline_look(motion, placement)}
+        return Shapes(outlines(motion, placement), **look, **placed)
     return Tracks(path(motion, placement), tail_length=len(motion.homographies), colormap=_TRACK_COLOURS, **placed)
 
 

@@ -19,9 +19,10 @@ from napari_fiberburst.settings import (
     choose,
 )
 
-# Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides.
+# Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides, and the result
+# card turns.
 _FIRST = ("sigma", "smoothness", "iterations", "time_budget", "device", "canvas", "upsample")
-_NOT_SHOWN = ("preview_every",)
+_NOT_SHOWN = ("preview_every", "leave_out")
 _LIVE = ("sigma", "learning_rate")
 _DEVICES = ("auto", "cpu", "cuda", "mps")
 _PRESET_TEXTS = {

@@ -42,6 +42,7 @@ class GlanceBox(QWidget):
         super().__init__(parent)
         self._input = chosen
         self._looked_at: object = None
+        self._is_brief = False
         self._said = ""
         self.strip, self.words = QLabel(), QLabel()
         self.strip.setAccessibleName("frames of the burst")
@@ -67,7 +68,7 @@ class GlanceBox(QWidget):
             return
         self._looked_at = key
         self.strip.clear()
-        self.strip.hide()
+        self._show_strip()
         if source is None:
             self._tell(str(key) if self._input.burst.value is not None else "")
             return
@@ -81,6 +82,14 @@ class GlanceBox(QWidget):
             _ignore_errors=True,
         )
 
+    def set_brief(self, *, is_brief: bool) -> None:
+        """Show words alone, because there is a result to look at."""
+        self._is_brief = is_brief
+        self._show_strip()
+
+    def _show_strip(self) -> None:
+        self.strip.setVisible(not self._is_brief and not self.strip.pixmap().isNull())
+
     def _take(self, seen: "tuple[object, Glance, NDArray[np.uint8]]") -> None:
         key, glance, frames = seen
         if key != self._looked_at:
@@ -89,7 +98,7 @@ class GlanceBox(QWidget):
         height, width = frames.shape[:2]
         image = QImage(frames.tobytes(), width, height, 3 * width, QImage.Format.Format_RGB888)
         self.strip.setPixmap(QPixmap.fromImage(image))
-        self.strip.show()
+        self._show_strip()
 
     def _take_error(self, error: Exception) -> None:
         self._tell(f"{self._said}<br>The frames cannot be read: {why(error, 'the burst could not be looked at')}")

@@ -36,6 +36,8 @@ class InputBox(QWidget):
         Their `value` is the layer chosen, or None.
     axes : QLineEdit
         Order of the burst's axes.
+    more : QCollapsible
+        What few bursts need: axes, region and further channels.
     channels : QListWidget
         Layers that may be further channels; those that are checked are.
     """
@@ -152,11 +154,11 @@ class InputBox(QWidget):
         self.channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
         first = form_layout()
         first.addRow("burst", self.burst.native)
-        first.addRow("axes", self.axes)
         bundle_row = row_of(self.bundle.native, self.open_button)
         bundle_row.setStretch(0, 1)
         first.addRow("bundle", bundle_row)
         self._rest = rest = form_layout()
+        rest.addRow("axes", self.axes)
         rest.addRow("region", self.region.native)
         rest.addRow("channels", self.channels)
         content = QWidget()
@@ -164,7 +166,8 @@ class InputBox(QWidget):
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addLayout(first)
-        whole.addWidget(section("More input", content))
+        self.more = section("More input", content)
+        whole.addWidget(self.more)
 
     def _whole(self) -> BurstSource:
         """Return the layers chosen, by the axes given, without a region."""
@@ -203,6 +206,8 @@ class InputBox(QWidget):
             if layer is not None:
                 take_recording(self._viewer, layer, axes)
             self.axes.setText(axes)
+            if layer is not None and not {"T", "Y", "X"} <= set(axes):
+                self.more.expand(animate=False)  # where they can be corrected
         self._list_channels()
         self.changed.emit()
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.data.burst import Acquisition
     from napari_fiberburst.results.progress import Progress
     from napari_fiberburst.results.reconstruction import Reconstruction
+    from napari_fiberburst.settings import Settings
 
 logger = logging.getLogger(__name__)
 
@@ -111,7 +112,7 @@ class Job:
         self._source: BurstSource | None = source
         self._choices = dict(choices)
         self._given, self._initial = bundle, initial
-        self._truth = _cropped(source)
+        self._truth = truth_of(source)
         self._scored = self._scoring = 0.0
         self.control = Control()
         self.acquisition: Acquisition | None = None
@@ -173,15 +174,22 @@ class Job:
         """Compare with the truth where there is one and an image, now and then."""
         began = time.perf_counter()
         is_soon = began - self._scored < self._scoring / _SCORING_SHARE and report.remaining != 0
-        is_frame = report.settings.flat().get("canvas", "frame") == "frame"
-        if self._truth is None or report.preview is None or not is_frame or is_soon:
+        if self._truth is None or report.preview is None or is_soon:
             return None
-        if not np.allclose(report.homographies[0], np.eye(3), atol=1e-6):
-            return None  # the image is over another frame, because frame 0 is of no use
-        scores = score(report.preview, report.homographies, self._truth)
+        scores = scores_of(report.preview, report.homographies, report.settings, self._truth)
         self._scored = time.perf_counter()
         self._scoring = self._scored - began
         return scores
+
+
+def scores_of(
+    image: NDArray[np.float32], homographies: NDArray[np.float64], settings: "Settings", truth: Truth | None
+) -> Scores | None:
+    """Compare an image and a motion with the truth; None where there is none, or they are not over frame 0."""
+    is_over_frame = settings.flat().get("canvas", "frame") == "frame" and np.allclose(
+        homographies[0], np.eye(3), atol=1e-6
+    )
+    return score(image, homographies, truth) if truth is not None and is_over_frame else None
 
 
 def score(image: NDArray[np.float32], homographies: NDArray[np.float64], truth: Truth) -> Scores:
@@ -204,8 +212,8 @@ def score(image: NDArray[np.float32], homographies: NDArray[np.float64], truth: 
     )
 
 
-def _cropped(source: BurstSource) -> Truth | None:
-    """Return the truth of the region that is used."""
+def truth_of(source: BurstSource) -> Truth | None:
+    """Return the truth of the region that is used; None where it is not known."""
     truth = source.truth
     if truth is None or source.region is None:
         return truth

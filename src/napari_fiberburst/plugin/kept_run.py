@@ -31,7 +31,7 @@ class KeptRun:
     source : BurstSource
         The burst.
     choices : dict
-        What `reconstruct` was given by name.
+        What `reconstruct` was given by name, or would be to come to the result as it was turned since.
     layers : RunLayers
         In the viewer.
     history : History
@@ -43,7 +43,7 @@ class KeptRun:
     turned_live : list of (float, str, object)
         Seconds, parameter and value of what was changed while it ran, which the call does not hold.
     result : Reconstruction or None
-        Once it has ended.
+        Once it has ended, and while it is not being turned.
     scores : Scores or None
         The last ones, where the truth is known.
     """
@@ -95,6 +95,11 @@ class KeptRun:
         method = named or str(result.settings.flat()["encoding"])
         error = "" if result.held_out_rmse is None else float(f"{result.held_out_rmse:.3g}")
         return self.name, method, round(result.seconds, 1), result.quality or "", error
+
+    def note_turned(self, name: str, value: Any) -> None:
+        """Note what was changed while it runs."""
+        self.turned_live.append((self.curve[-1].seconds if self.curve else 0.0, name, value))
+        self.layers.tell("turned_live", list(self.turned_live))
 
     @property
     def has_bundle(self) -> bool:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,8 @@ from napari_fiberburst.plugin.evidence import (
     kinds_of,
     motion_layer,
     motion_of,
+    outline_look,
+    outlined_frames,
     outlines,
     path,
     result_layers,
@@ -61,6 +64,12 @@ class RunLayers:
         self._motion: Motion | None = None
         self._result: Reconstruction | None = None
         self._frames: Any = None
+        self._back: list[str] = []
+
+    @property
+    def is_removed(self) -> bool:
+        """Whether the run was taken out of the viewer for good."""
+        return self._is_removed
 
     @property
     def images(self) -> list[Layer]:
@@ -110,6 +119,39 @@ class RunLayers:
             # napari keeps layers of shapes that have been removed: what is large goes with the image alone.
             layer.metadata = self._metadata({"reconstruction": result} if _is_image(kind) else {})
         self._put_motion()
+        for kind in self._back:
+            self.switch(kind, True)
+        self._back = []
+
+    def unfinish(self) -> None:
+        """Take away what rests on a result that is no longer shown; what was on comes back with the next result."""
+        self._back = [kind for kind in self.kinds if kind not in MOTION_KINDS and self.is_on(kind)]
+        for kind in self._back:
+            self.switch(kind, False)
+        self._result = None
+        for layer in self._layers.values():
+            layer.metadata = self._metadata()
+
+    def leave_out(self, frames: tuple[int, ...]) -> None:
+        """Show which frames the image is made without."""
+        if self._motion is not None:
+            self._motion = replace(self._motion, left_out=frames)
+            self._put_motion()
+
+    def would_leave_some(self, frames: tuple[int, ...]) -> bool:
+        """Whether any registered frame takes part without these."""
+        return self._motion is not None and not set(self._motion.known) <= set(frames)
+
+    def outlined_at(self, event: Any) -> int | None:
+        """Return the frame on whose outline, or inside it, the mouse is; None where that is on none."""
+        layer = self._layers.get("outlines")
+        if layer is None or self._motion is None or not self._has(layer) or not layer.visible:
+            return None
+        at = {"view_direction": event.view_direction, "dims_displayed": event.dims_displayed}
+        value = layer.get_value(event.position, **at, world=True)
+        if value is None or value[0] is None:
+            return None
+        return outlined_frames(self._motion, self.placement)[int(value[0])]
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -197,6 +239,9 @@ class RunLayers:
         for kind, draw in (("outlines", outlines), ("path", path)):
             if self.is_on(kind):
                 self._layers[kind].data = draw(motion, self.placement)
+        if self.is_on("outlines"):
+            for name, value in outline_look(motion, self.placement).items():
+                setattr(self._layers["outlines"], name, value)
 
     def _above_images(self) -> int:
         """Return the place in the list of layers above all of the run's images: what is new is seen."""

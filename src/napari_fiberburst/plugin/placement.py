@@ -142,6 +142,15 @@ class Placement:
         scale[rows_and_columns] *= step
         return {"scale": tuple(scale), "translate": tuple(translate), **kept}
 
+    def frame_at(self, point: Sequence[float]) -> int | None:
+        """Return the frame at a point of the viewer, in world coordinates; None where there is none."""
+        if "T" not in self.axes or len(point) < len(self.axes):
+            return None
+        axis = self.axes.index("T")
+        at = point[len(point) - len(self.axes) + axis]
+        frame = round((at - self.translate[axis]) / self.scale[axis])
+        return frame if 0 <= frame < self.sizes["T"] else None
+
     def vertices(self, points: NDArray[np.float64], frame: int) -> list[NDArray[np.float64]]:
         """Return frame-0 points (N, 2) as (x, y) in the axes of a layer of shapes, once per position of other axes.
 

@@ -58,6 +58,11 @@ class RunsPanel(QWidget):
         """All runs, oldest first."""
         return tuple(reversed(self._runs))
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no run, and none that could be brought back."""
+        return not self._runs and not self._removed
+
     def add(self, run: KeptRun) -> None:
         """Keep a run, in the first row, and select it; what was removed before is let go."""
         self._let_go()

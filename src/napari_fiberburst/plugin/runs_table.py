@@ -9,7 +9,7 @@ from qtpy.QtWidgets import QHeaderView, QTableWidget, QTableWidgetItem, QWidget
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.thumbnails import icon_of
 
-_LINES_OF_RUNS, _ICON = 3, 20
+_MOST_LINES, _ICON = 3, 20
 _WHOLE_ROWS = QItemSelectionModel.SelectionFlag.Rows
 _NARROWEST_COLUMN, _ABOVE_AND_BELOW = 30, 6
 # What a row tells of a run, and in more words.
@@ -64,6 +64,7 @@ class RunsTable(QTableWidget):
                     item.setFlags(item.flags() & ~Qt.ItemFlag.ItemIsEditable)
                 self.setItem(row, column, item)
             self._fill(row, run)
+        self._fit_height()
         self.select(run)
 
     def select(self, run: KeptRun) -> None:
@@ -80,6 +81,7 @@ class RunsTable(QTableWidget):
         """Show a run no more; says nothing of which is the current one then."""
         with self._quiet():
             self.removeRow(self._row_of(run))
+        self._fit_height()
 
     def refresh(self) -> None:
         """Show what has become of the runs."""
@@ -109,7 +111,12 @@ class RunsTable(QTableWidget):
         self.setSelectionMode(QTableWidget.SelectionMode.ExtendedSelection)
         self.setSortingEnabled(True)
         self.setShowGrid(False)
-        self.setFixedHeight(_LINES_OF_RUNS * (_ICON + 1) + self.fontMetrics().height() + 2 * _ABOVE_AND_BELOW)
+        self._fit_height()
+
+    def _fit_height(self) -> None:
+        """Take no more room than there are runs, as far as it goes."""
+        lines = min(max(self.rowCount(), 1), _MOST_LINES)
+        self.setFixedHeight(lines * (_ICON + 1) + self.fontMetrics().height() + 2 * _ABOVE_AND_BELOW)
 
     def _run_of(self, row: int) -> KeptRun | None:
         item = self.item(row, 0)

@@ -1,5 +1,6 @@
 """Reconstruction: the image a burst gave, how its frames lie on it, and where it all came from."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io.picture import as_picture, write_png
 from napari_fiberburst.io.results import (
     check_output,
@@ -54,6 +56,25 @@ class Renderer(Protocol):
         """Return the fitted parameters by name."""
 
 
+class Look(Protocol):
+    """What draws the scene of a run as it will be at other settings, while somebody turns them."""
+
+    def image(
+        self, *, smoothness: float | None = None, leave_out: Collection[int] = ()
+    ) -> tuple[NDArray[np.float32], Canvas]:
+        """Return the image in the burst's intensity units, and where it lies."""
+
+
+class Solver(Protocol):
+    """What a run leaves behind to solve its scene again."""
+
+    def solve(self, *, smoothness: float | None = None, leave_out: Collection[int] = ()) -> "Reconstruction":
+        """Solve and judge the scene, as `Reconstruction.solve_again` does."""
+
+    def look(self) -> Look:
+        """Return what draws the scene at other settings, many times as fast as it is solved and judged."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reconstruction(Diagnostics):
     """A clean image of the scene, the motion of the burst, and how they were made.
@@ -89,6 +110,9 @@ class Reconstruction(Diagnostics):
         is the last good state.
     acquisition : Acquisition
         What is known of the burst.
+    solver : Solver or None
+        What `solve_again` needs of the run: samples and a first scene, some MB. None where the scene is no spline, the
+        run was stopped, or the result was read from a file.
 
     Notes
     -----
@@ -109,11 +133,38 @@ class Reconstruction(Diagnostics):
     ending: Ending
     acquisition: Acquisition
     renderer: Renderer = field(repr=False)
+    solver: Solver | None = field(default=None, repr=False)
 
     @property
     def compression(self) -> float:
         """1 - bytes of the parameters as float32 / bytes of the burst as it came; below 0 it takes more room."""
         return 1 - 4 * self.parameters / self.acquisition.nbytes
+
+    def solve_again(self, *, smoothness: float | None = None, leave_out: Collection[int] = ()) -> "Reconstruction":
+        """Solve the scene once more from where its frames lie, at another smoothness or from other frames.
+
+        Nothing is registered anew, so it takes a part of the time of the run. The result is a reconstruction like any
+        other, judged anew; `reconstruct(burst, preset=result.requested)` comes to the same bits.
+
+        Parameters
+        ----------
+        smoothness : float, optional
+            Weight of the smoothness prior; more is smoother. By default the burst chooses it.
+        leave_out : collection of int
+            Frames to leave out, all others that were registered take part. It takes longer than another smoothness,
+            because what is known of gains and outliers rests on the frames.
+
+        Raises
+        ------
+        SettingsError
+            There is nothing to solve again (`solver` is None), a value is out of range, or no frame is left.
+        """
+        if self.solver is None:
+            raise SettingsError(
+                "only a spline that was solved in this process, to its end, can be solved again; run the burst anew "
+                "with encoding 'spline'"
+            )
+        return self.solver.solve(smoothness=smoothness, leave_out=leave_out)
 
     def render(
         self, scale: float = 1.0, bounds: tuple[float, float, float, float] | None = None

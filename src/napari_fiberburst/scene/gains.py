@@ -34,6 +34,13 @@ class GainChange:
     shares: Tensor | None = None
     channels: Tensor | None = None
 
+    def taken_out_of(self, samples: Samples) -> Samples:
+        """Return samples without these gains."""
+        if self.shares is not None:
+            weights = samples.weights * self.shares**2
+            samples = replace(samples, values=samples.values / self.shares[:, None], weights=weights)
+        return samples if self.channels is None else samples.without_gains(self.channels)
+
 
 def refine_gains(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> tuple[Samples, GainChange]:
     """Take finer gains out of samples, by the scene that other samples agree on.
@@ -63,7 +70,7 @@ def refine_gains(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor)
     shares = None
     if samples.kind == "pixels" and not samples.gains_known:
         shares = _shares(agreement.sum(dim=1), power.sum(dim=1), samples.core_index)
-        samples = replace(samples, values=samples.values / shares[:, None], weights=samples.weights * shares**2)
+        samples = GainChange(shares=shares).taken_out_of(samples)
         agreement = agreement / shares[:, None]
     if samples.values.shape[2] == 1:
         return samples, GainChange(shares=shares)
@@ -82,7 +89,7 @@ def refine_gains(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor)
     channels = (1 + torch.where(known[:, None], shrunk, torch.zeros_like(shrunk))).clamp(
         _LEAST_CHANNEL_GAIN, _MOST_CHANNEL_GAIN
     )
-    return samples.without_gains(channels), GainChange(shares=shares, channels=channels)
+    return GainChange(channels=channels).taken_out_of(samples), GainChange(shares=shares, channels=channels)
 
 
 def measured_gains(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> tuple[Tensor, Tensor]:

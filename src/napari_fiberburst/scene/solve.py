@@ -101,6 +101,40 @@ class Scene(Stored):
         return self.equations.image(self.coefficients, self.smoothness)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Draft:
+    """What a first scene has told of its samples: all that solving needs to go on from, at any smoothness.
+
+    Attributes
+    ----------
+    coefficients : Tensor
+        (C, H, W), the first scene, at a usual smoothness: where solving starts from.
+    gains, outliers, smear, agreement
+        As those of `Scene`.
+    smoothness : float or None
+        That the burst itself asks for; None where it has not been asked.
+    """
+
+    coefficients: Tensor
+    gains: GainChange
+    outliers: Tensor | None
+    smear: Smear | None
+    smoothness: float | None
+    agreement: RingCorrelation | None
+
+    def refined(self, samples: Samples, registration: Registration) -> Samples:
+        """Return samples as they were taken without the gains, exposures and outliers that are known."""
+        samples = self.gains.taken_out_of(registration.correct(samples))
+        if self.outliers is None:
+            return samples
+        return replace(samples, weights=samples.weights * ~self.outliers)
+
+    def looks(self, samples: Samples, registration: Registration) -> Tensor:
+        """Return where samples look, (T, N, 2), or (T, N, K, 2) where they moved while a frame was exposed."""
+        points = registration.points(samples.positions)
+        return points if self.smear is None else self.smear.paths(points)
+
+
 def solve(
     samples: Samples,
     registration: Registration,
@@ -177,9 +211,23 @@ def solving(
     seed: int,
 ) -> Generator[Scene, None, Scene]:
     """Solve as `solve` does; yields a draft, twice, and the scene before held-out samples are taken in."""
+    draft = yield from drafting(samples, registration, grid, is_asked=smoothness is None)
+    return (
+        yield from finishing(draft, samples, registration, grid, smoothness=smoothness, held_out=held_out, seed=seed)
+    )
+
+
+def drafting(
+    samples: Samples, registration: Registration, grid: Grid, *, is_asked: bool
+) -> Generator[Scene, None, Draft]:
+    """Learn from a first scene what solving needs to know of the samples; yields that scene, twice.
+
+    It does not depend on the smoothness that the scene will have, so one draft serves them all. `is_asked` tells
+    whether the burst is to choose that; what halves of it agree on is found anyhow.
+    """
     samples = registration.correct(samples)
     points = registration.points(samples.positions)
-    scene = _draft(samples, points, grid, smoothness)
+    scene = _draft(samples, points, grid, None)
     if not registration.is_still:
         samples, gains = refine_gains(samples, points, grid, scene.filtered)
         scene = _without_outliers(replace(scene, samples=samples, gains=gains), points)
@@ -188,26 +236,54 @@ def solving(
         scene = replace(scene, smear=smear)
         points = scene.looks(points)
     yield scene
-    chosen = Smoothness(smoothness, None) if smoothness is not None else _choose(scene, points, registration)
-    scene = replace(scene, agreement=chosen.agreement)
-    yield scene
+    # Of a burst that stands still only the smoothness would be learned, and that takes long.
+    is_told = is_asked or not registration.is_still
+    told = _choose(scene, points, registration) if is_told else Smoothness(UNTOLD, None)
+    yield replace(scene, agreement=told.agreement)
+    return Draft(
+        coefficients=scene.coefficients,
+        gains=scene.gains,
+        outliers=scene.outliers,
+        smear=scene.smear,
+        smoothness=told.weight if is_told else None,
+        agreement=told.agreement,
+    )
+
+
+def finishing(
+    draft: Draft,
+    samples: Samples,
+    registration: Registration,
+    grid: Grid,
+    *,
+    smoothness: float | None,
+    held_out: float,
+    seed: int,
+) -> Generator[Scene, None, Scene]:
+    """Solve the scene for good from its draft; yields it before held-out samples are taken in."""
+    weight = smoothness or draft.smoothness or UNTOLD
+    looks, samples = draft.looks(samples, registration), draft.refined(samples, registration)
     left_out = _left_out(samples, held_out, seed)
-    equations = assemble(grid, samples, points, (~left_out).to(points))
-    coefficients = equations.solve(chosen.weight, scene.coefficients)
-    missed, mass = misfit(samples, points, grid, equations.through(coefficients), left_out)
-    scene = replace(
-        scene,
+    equations = assemble(grid, samples, looks, (~left_out).to(looks))
+    coefficients = equations.solve(weight, draft.coefficients)
+    missed, mass = misfit(samples, looks, grid, equations.through(coefficients), left_out)
+    scene = Scene(
         coefficients=coefficients,
-        smoothness=chosen.weight,
+        smoothness=weight,
         equations=equations.without_paths(),
+        samples=samples,
+        gains=draft.gains,
+        outliers=draft.outliers,
+        smear=draft.smear,
         is_draft=False,
+        agreement=draft.agreement,
         held_out_rmse=(missed / mass) ** 0.5 if mass > 0 else None,
     )
     yield scene
     if not left_out.any():
         return scene
-    equations = equations + assemble(grid, samples, points, left_out.to(points))
-    coefficients = equations.solve(chosen.weight, coefficients)
+    equations = equations + assemble(grid, samples, looks, left_out.to(looks))
+    coefficients = equations.solve(weight, coefficients)
     return replace(scene, coefficients=coefficients, equations=equations.without_paths())
 
 

@@ -185,20 +185,27 @@ class NormalEquations:
             What it was solved with.
         """
         density = self.density()
-        mean = float(steady.mean(density[density >= _LEAST_DENSITY * density.max()]))
+        mean = self._usual_density()
         bands = torch.stack([steady.total(band) for band in self.stencil.bands])
         _, right, below, below_right, below_left = bands / steady.total(density).clamp_min(1e-12)
         ties = below_right + below_left
-        padded = torch.nn.functional.pad(scene[None], (_RIM,) * 4, mode="replicate")[0]
-        height, width = padded.shape[-2:]
-        along_y, along_x = torch.fft.fftfreq(height).to(scene), torch.fft.rfftfreq(width).to(scene)
+        along_y, along_x = _frequencies(scene)
         (square_y, gain_y), (square_x, gain_x) = _read_gain(along_y, below + ties), _read_gain(along_x, right + ties)
         square, gain = square_y[:, None] * square_x, gain_y[:, None] * gain_x
         passed = mean * self._transfer(along_y, along_x) ** 2
         prior = self._weight(smoothness) * self.prior.response(along_y, along_x)
-        ideal = (passed * square + prior) / (gain * (passed + prior)).clamp_min(1e-12)
-        shown: Tensor = steady.irfft2(torch.fft.rfft2(padded) * ideal, (height, width))
-        return shown[..., _RIM:-_RIM, _RIM:-_RIM]
+        return _passed(scene, (passed * square + prior) / (gain * (passed + prior)).clamp_min(1e-12))
+
+    def carried(self, scene: Tensor, before: float, after: float) -> Tensor:
+        """Return about what a solution (C, H, W) at one smoothness becomes at another, as if sampling were even.
+
+        Most of the change is in it, so conjugate gradients that start from it are soon done.
+        """
+        along_y, along_x = _frequencies(scene)
+        passed = self._usual_density() * self._transfer(along_y, along_x) ** 2
+        prior = self.prior.response(along_y, along_x)
+        stiffness = [(passed + self._weight(weight) * prior).clamp_min(1e-12) for weight in (before, after)]
+        return _passed(scene, stiffness[0] / stiffness[1])
 
     def mean(self) -> Tensor:
         """Return an even scene of the right brightness, (C, H, W): what the smoothest one comes to."""
@@ -239,6 +246,11 @@ class NormalEquations:
         prior = self._weight(1.0) * self.prior.response(along_y, along_x).diagonal()
         return passed.double().cpu().numpy(), prior.double().cpu().numpy()
 
+    def _usual_density(self) -> float:
+        """Return the mean weight of samples to a node, where there are any to speak of."""
+        density = self.density()
+        return float(steady.mean(density[density >= _LEAST_DENSITY * density.max()]))
+
     def _weight(self, smoothness: float) -> float:
         """Return the prior's weight for nodes that are not a pixel apart."""
         return smoothness / self.grid.spacing ** (2 * self.prior.order - 2)
@@ -248,6 +260,19 @@ class NormalEquations:
         if self.footprint is None:
             return torch.ones(len(along_y), len(along_x)).to(along_y)
         return self.footprint.transfer(along_y, along_x)
+
+
+def _frequencies(scene: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the frequencies of scenes (C, H, W) and their rim along y and along x, cycles per node."""
+    height, width = (side + 2 * _RIM for side in scene.shape[-2:])
+    return torch.fft.fftfreq(height).to(scene), torch.fft.rfftfreq(width).to(scene)
+
+
+def _passed(scene: Tensor, response: Tensor) -> Tensor:
+    """Return scenes (C, H, W) through a filter of this response at `_frequencies`."""
+    padded = torch.nn.functional.pad(scene[None], (_RIM,) * 4, mode="replicate")[0]
+    shown: Tensor = steady.irfft2(torch.fft.rfft2(padded) * response, (padded.shape[-2], padded.shape[-1]))
+    return shown[..., _RIM:-_RIM, _RIM:-_RIM]
 
 
 def _read_gain(frequency: Tensor, offset_variance: Tensor) -> tuple[Tensor, Tensor]:

@@ -100,6 +100,9 @@ class SplineMethod(_BehindBundle):
         most=1e6,
     )
     iterations: int | None = parameter(None, _STEPS, least=1)
+    leave_out: tuple[int, ...] = parameter(
+        (), "Numbers of frames that are registered like the others, and left out of the image."
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.motion, Flow):

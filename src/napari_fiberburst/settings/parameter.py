@@ -14,6 +14,14 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from napari_fiberburst.errors import SettingsError
 
+_IN_WORDS = {
+    int: "an integer",
+    float: "a number",
+    str: "a text",
+    bool: "true or false",
+    tuple: "a tuple of frame numbers, the first one 0",
+}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
@@ -24,7 +32,7 @@ class Parameter:
     name : str
         The field's name.
     kind : type
-        int, float, str or bool.
+        int, float, str, bool, or tuple, of frame numbers.
     default : object
         The value it has where nobody turns it.
     doc : str
@@ -53,7 +61,7 @@ class Parameter:
         if self.choices:
             words = "one of " + ", ".join(self.choices)
         else:
-            words = {int: "an integer", float: "a number", str: "a text", bool: "true or false"}[self.kind]
+            words = _IN_WORDS[self.kind]
             bounds = [("of at least", self.least), ("above", self.above), ("of at most", self.most)]
             limits = " and ".join(f"{text} {bound:g}" for text, bound in bounds if bound is not None)
             words = f"{words} {limits}".strip()
@@ -67,6 +75,8 @@ class Parameter:
             return isinstance(value, str) and (not self.choices or value in self.choices)
         if self.kind is bool:
             return isinstance(value, bool)
+        if self.kind is tuple:
+            return isinstance(value, tuple | list) and all(_is_frame_number(item) for item in value)
         wanted = Integral if self.kind is int else Real
         if isinstance(value, bool) or not isinstance(value, wanted):
             return False
@@ -143,7 +153,12 @@ def check(settings: object) -> None:
         value = getattr(settings, name)
         parameter.check(value)
         if value is not None:
-            object.__setattr__(settings, name, parameter.kind(value))  # of a frozen dataclass, while it is made
+            own = tuple(int(item) for item in value) if parameter.kind is tuple else parameter.kind(value)
+            object.__setattr__(settings, name, own)  # of a frozen dataclass, while it is made
+
+
+def _is_frame_number(value: object) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
 def _declared(settings_type: type) -> Iterator[Field[Any]]:
@@ -153,6 +168,7 @@ def _declared(settings_type: type) -> Iterator[Field[Any]]:
 def _read(item: Field[Any], hint: Any) -> Parameter:
     options = get_args(hint) if isinstance(hint, UnionType) else (hint,)
     (kind,) = [option for option in options if option is not NoneType]
+    kind = tuple if get_origin(kind) is tuple else kind
     choices = get_args(kind) if get_origin(kind) is Literal else ()
     return Parameter(
         name=item.name,

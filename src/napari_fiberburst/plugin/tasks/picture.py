@@ -20,6 +20,7 @@ from napari_fiberburst.plugin.calls import as_python
 from napari_fiberburst.plugin.copying import CopyButtons
 from napari_fiberburst.plugin.departures import Departures
 from napari_fiberburst.plugin.display import AnimationThrottle, Display
+from napari_fiberburst.plugin.favouring import RegionWatch
 from napari_fiberburst.plugin.form import SettingsForm
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.job import Job, load_solver
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     import napari
     from napari.layers import Layer
 
+    from napari_fiberburst.control import Region
     from napari_fiberburst.results.progress import Progress
 
 
@@ -57,6 +59,7 @@ class PictureTask(Task):
         self.runner = Runner(self)
         self.runs = RunsPanel(viewer)
         self.display = Display(viewer, self)
+        self._regions = RegionWatch(viewer, self._favour)
         self.pause_button = QPushButton("Pause")
         self.stop_button = QPushButton("Stop")
         self._memory = QLabel()
@@ -68,6 +71,7 @@ class PictureTask(Task):
         self._lay_out()
         self._connect()
         self._follow_state("ready")
+        self._follow_runs()
         self._take_input()
         self.departures.begin_anew()
         self._warm_up()
@@ -75,7 +79,7 @@ class PictureTask(Task):
     @property
     def is_empty(self) -> bool:
         """Whether no run is kept."""
-        return not self.runs.runs
+        return self.runs.is_empty
 
     def start(self) -> None:
         """Run what the form says. Does nothing while a run is going."""
@@ -146,7 +150,10 @@ class PictureTask(Task):
         self._shown_at_end = "image"
         self.display.begin()
         self.runs.add(self._run)
+        self._follow_runs()
         self.runner.start(job, f"{name} of {source.name}")
+        if self._is_network:
+            self._regions.begin(source)
 
     def _show(self, report: "Progress") -> None:
         job, run = self.runner.job, self._run
@@ -184,12 +191,19 @@ class PictureTask(Task):
     def _forget(self, run: KeptRun) -> None:
         if run is self._run:
             self._run = None
+        self._follow_runs()
+
+    def _follow_runs(self) -> None:
+        """Show what is kept of runs once there are any."""
+        for widget in (self.display.curve_box, self.runs, self.display.past_box):
+            widget.setVisible(not self.is_empty)
         self.kept_changed.emit()
 
     def _follow_state(self, state: str) -> None:
         """Offer what can be done now."""
         is_ready = state == "ready"
         if is_ready:
+            self._regions.end()
             self._throttle.restore()
         else:
             self._throttle.slow(self.window() or self)
@@ -227,9 +241,15 @@ class PictureTask(Task):
         except SettingsError as error:
             show_error(str(error))
             return
-        seconds = job.curve[-1].seconds if job.curve else 0.0
-        run.turned_live.append((seconds, name, value))
-        run.layers.tell("turned_live", list(run.turned_live))
+        run.note_turned(name, value)
+
+    def _favour(self, region: "Region | None") -> None:
+        """Let the running fit learn a region first that was drawn just now."""
+        job, run = self.runner.job, self._run
+        if job is not None and run is not None:
+            job.control.region = region
+            run.note_turned("region", region)
+            self.display.status.setText("the region drawn is learned first" if region else "no region is favoured")
 
     def _take_input(self) -> None:
         if self.input.burst.value is not self._burst:
@@ -312,6 +332,7 @@ class PictureTask(Task):
         self.runner.failed.connect(self._fail)
         self.runner.state_changed.connect(self._follow_state)
         self.display.complete.connect(self._show_what_was_asked)
+        self.display.card.steering.changed.connect(self.runs.refresh)
         # The window can go without a word to this widget; what is called then must not need it.
         self.destroyed.connect(partial(_let_go, self.runner, self.display, self._throttle))
 
