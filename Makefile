@@ -54,8 +54,7 @@ bench-plugin: .venv/gui
 	$(BIN)/python benchmarks/plugin.py
 
 screenshots: .venv/dev
-	FIBERBURST_SCREENSHOTS=docs $(BIN)/python -m pytest tests/plugin/test_window.py
-	rm docs/plugin_light_1920x1080.png docs/plugin_dark_1920x1080.png
+	$(BIN)/python examples/show_the_plugin.py docs/plugin
 	$(BIN)/python examples/record_the_plugin.py docs/plugin.gif
 
 # The site, in site/; what is wrong in it is an error.

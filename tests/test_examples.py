@@ -7,7 +7,7 @@ import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 # Opens the real window on a whole sample; what it does is what tests/plugin/test_window.py asserts.
-ON_SCREEN = {"record_the_plugin"}
+ON_SCREEN = {"record_the_plugin", "show_the_plugin"}
 
 
 def test_there_are_examples():

@@ -1,10 +1,4 @@
-"""The real window, as a newcomer uses it: File > Open Sample, Plugins > Fiber burst reconstruction, Start.
-
-The images in docs/ come from here: `make screenshots`.
-"""
-
-import os
-from pathlib import Path
+"""The real window, as a newcomer uses it: File > Open Sample, Plugins > Fiber burst reconstruction, Start."""
 
 import numpy as np
 from npe2 import PluginManifest
@@ -44,14 +38,13 @@ def test_a_newcomer_sees_it_resolve(make_napari_viewer, qtbot, npe2pm, tmp_path)
     qtbot.waitUntil(lambda: seen.widget().width() <= seen.viewport().width())
     # The honeycomb's dark gaps are gone from what is on the screen.
     assert dark(after) < 0.5 * dark(before)
-    folder = Path(os.environ.get("FIBERBURST_SCREENSHOTS", tmp_path))
     for theme in ("dark", "light"):
         viewer.theme = theme
         for width, height in ((1280, 800), (1920, 1080)):
             viewer.window.resize(width, height)
             viewer.reset_view()
             qtbot.wait(300)
-            path = folder / f"plugin_{theme}_{width}x{height}.png"
+            path = tmp_path / f"plugin_{theme}_{width}x{height}.png"
             viewer.window.screenshot(str(path), canvas_only=False, flash=False)
             assert imread(path).shape[:2] == (height, width)
 

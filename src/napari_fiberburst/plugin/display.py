@@ -102,9 +102,9 @@ class Display(QObject):
         self.card.refresh()
         self.complete.emit(run)
 
-    def fail(self) -> None:
-        """Say that a run came to nothing."""
-        self.status.setText("The run failed. Change the settings or the burst, and press Start.")
+    def fail(self, problem: str) -> None:
+        """Say why a run came to nothing."""
+        self.status.setText(f"The run failed: {problem}.")
 
     def select(self, run: KeptRun | None) -> None:
         """Let card and history be those of a run, at its newest image.

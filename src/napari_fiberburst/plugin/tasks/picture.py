@@ -185,7 +185,7 @@ class PictureTask(Task):
         """Say why a run came to nothing."""
         if self._run is not None:
             self.runs.remove(self._run)
-        self.display.fail()
+        self.display.fail(problem)
         show_error(problem)
 
     def _forget(self, run: KeptRun) -> None:

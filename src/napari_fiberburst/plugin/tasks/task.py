@@ -50,6 +50,10 @@ class Task(QWidget):
         """Whether there is nothing to show of it once the burst is gone."""
         raise NotImplementedError
 
+    def start(self) -> None:
+        """Do it, in another thread, or say why not."""
+        raise NotImplementedError
+
     def open(self) -> None:
         """Follow the viewer, again where the dock was closed."""
 
