@@ -10,6 +10,7 @@ from qtpy.QtWidgets import QCheckBox, QGridLayout, QLabel, QVBoxLayout, QWidget
 from napari_fiberburst.plugin.evidence import KINDS
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.reporting import ReportBox
+from napari_fiberburst.plugin.sections import order_tabs
 from napari_fiberburst.plugin.steering import SteeringBox
 
 _COLUMNS, _SPACING = 2, 3
@@ -119,6 +120,7 @@ class ResultCard(QWidget):
         for number, kind in enumerate(kinds):
             self._grid.addWidget(self.switches[kind], *divmod(number, _COLUMNS))
             self.switches[kind].setVisible(True)
+        order_tabs(self)
 
     def _switch(self, kind: str, on: bool) -> None:
         if self._run is not None:

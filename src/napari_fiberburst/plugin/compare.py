@@ -201,6 +201,7 @@ class CompareBox(QWidget):
         self.button.setCheckable(True)
         self.button.setToolTip("Show the run selected above (A) and another image (B) alone; press again to end it.")
         self.flip.setCheckable(True)
+        self.flip.setAccessibleName("show the other one")
         self.flip.setToolTip("Show the other one of the two. The space bar presses it, too.")
         self.other.setToolTip("What to compare with the run selected above.")
         self.line.setToolTip("Moves the line between A and B.")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from napari.components import ViewerModel
 from qtpy.QtCore import QObject, Qt, Signal
 from qtpy.QtGui import QMovie
-from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QHBoxLayout, QLabel, QProgressBar, QSlider, QVBoxLayout, QWidget
 from superqt import QLabeledSlider
 
 from napari_fiberburst.plugin.card import ResultCard
@@ -144,6 +144,8 @@ class Display(QObject):
         self.bar.setVisible(False)
         self.slider.setOrientation(Qt.Orientation.Horizontal)
         self.slider.setMaximum(0)
+        for slider in self.slider.findChildren(QSlider):
+            slider.setAccessibleName("history")
         self.slider.setToolTip("Goes back through the images of the run that is selected.")
         state, past = QWidget(), QWidget()
         column, row = QVBoxLayout(state), QHBoxLayout(past)

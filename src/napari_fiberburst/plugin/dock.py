@@ -10,7 +10,7 @@ from napari_fiberburst.plugin.empty import EmptyBox
 from napari_fiberburst.plugin.glance_box import GlanceBox
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.pickers import WheelFilter
-from napari_fiberburst.plugin.sections import Column
+from napari_fiberburst.plugin.sections import Column, order_tabs
 from napari_fiberburst.plugin.tasks import TASKS
 from napari_fiberburst.plugin.tasks.picture import PictureTask
 from napari_fiberburst.plugin.tasks.task import Task
@@ -133,6 +133,7 @@ class FiberBurstWidget(QWidget):
             column.addWidget(widget)
         scroll = Column(content)
         WheelFilter(scroll)
+        order_tabs(content)
         around = QVBoxLayout(self)
         around.setContentsMargins(0, 0, 0, 0)
         around.addWidget(scroll)

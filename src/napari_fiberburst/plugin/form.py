@@ -158,7 +158,9 @@ class SettingsForm(QWidget):
         self._motion.setToolTip("How the object moves between frames.")
         self._encoding.setToolTip("How the scene is held while it is fitted.")
         for label, box in (("preset", self._preset), ("motion", self._motion), ("encoding", self._encoding)):
+            box.setAccessibleName(label)
             self._first.addRow(label, box)
+        self._device.setAccessibleName("device")
         for name in _FIRST:
             row = self._device if name == "device" else self._rows[name]
             self._first.addRow(name.replace("_", " "), row)

@@ -151,6 +151,10 @@ class InputBox(QWidget):
         self.open_button.setToolTip("Open a bundle that was kept: a .bundle file.")
         self.region.tooltip = "A layer of shapes, whose selected or last rectangle limits the run: for a quick look."
         self.channels.setToolTip("Layers that are further channels of the same burst; same shape, one grey layer each.")
+        for picker, name in ((self.burst, "burst"), (self.bundle, "bundle"), (self.region, "region")):
+            picker.native.setAccessibleName(name)
+        self.axes.setAccessibleName("axes")
+        self.channels.setAccessibleName("further channels")
         self.channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
         first = form_layout()
         first.addRow("burst", self.burst.native)

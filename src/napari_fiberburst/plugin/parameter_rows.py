@@ -86,7 +86,9 @@ class ParameterRow(QWidget):
         if self.auto is not None:
             row.addWidget(self.auto)
             self.auto.setToolTip(f"Leave {self.label} open.")
+            self.auto.setAccessibleName(f"{self.label}: auto")
             self.auto.toggled.connect(self._follow_auto)
+        self.editor.native.setAccessibleName(self.label)
         for part in (self, self.editor.native):
             part.setToolTip(f"{parameter.doc}\n({parameter.name}: {parameter.expected})")
         self.set_value(parameter.default)

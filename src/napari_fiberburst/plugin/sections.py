@@ -1,10 +1,12 @@
-"""How the dock is laid out: sections that fold away, rows."""
+"""How the dock is laid out: sections that fold away, rows, and the way of the tab key."""
 
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 from qtpy.QtCore import QEvent, QSize, Qt
 from qtpy.QtGui import QIcon, QPixmap
-from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QScrollArea, QVBoxLayout, QWidget
+from qtpy.QtWidgets import QFormLayout, QHBoxLayout, QLayout, QScrollArea, QVBoxLayout, QWidget
 from superqt import QCollapsible
 
 _ABOVE_CONTENT, _BELOW_CONTENT = 4, 10
@@ -67,7 +69,13 @@ def section(title: str, content: QWidget) -> QCollapsible:
     made.setContent(holder)
     holder.installEventFilter(made)
     made.collapse(animate=False)
-    made.toggled.connect(lambda is_open: made.setText(unfolded if is_open else folded))
+    holder.hide()  # superqt makes it flat, and the tab key would still go through what is in it
+
+    def follow(is_open: bool) -> None:
+        made.setText(unfolded if is_open else folded)
+        holder.setVisible(is_open)
+
+    made.toggled.connect(follow)
     return made
 
 
@@ -92,3 +100,33 @@ def row_of(*widgets: QWidget) -> QHBoxLayout:
     for widget in widgets:
         row.addWidget(widget)
     return row
+
+
+def order_tabs(widget: QWidget) -> None:
+    """Let the tab key go from control to control as they stand, and not as they were made."""
+    stops = list(_stops(widget))
+    for before, after in pairwise(stops):
+        QWidget.setTabOrder(before, after)
+
+
+def _stops(widget: QWidget) -> Iterator[QWidget]:
+    """Yield what the tab key stops at in a widget, from top to bottom."""
+    if widget.focusPolicy() & Qt.FocusPolicy.TabFocus:
+        yield widget
+        return
+    layout = widget.layout()
+    within = widget.widget() if isinstance(widget, QScrollArea) else None
+    if layout is not None:
+        yield from _stops_in(layout)
+    elif within is not None:
+        yield from _stops(within)
+
+
+def _stops_in(layout: QLayout) -> Iterator[QWidget]:
+    for number in range(layout.count()):
+        item = layout.itemAt(number)
+        widget, inner = (None, None) if item is None else (item.widget(), item.layout())
+        if widget is not None:
+            yield from _stops(widget)
+        elif inner is not None:
+            yield from _stops_in(inner)
