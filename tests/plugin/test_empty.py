@@ -13,7 +13,7 @@ MILLISECONDS = 60_000
 
 def is_empty(dock):
     """Whether the dock offers to open a burst, and nothing else."""
-    assert dock.empty.isHidden() != dock.filled.isHidden()
+    assert dock.empty.isHidden() == (dock.input.burst.value is not None)
     return dock.filled.isHidden()
 
 
@@ -32,7 +32,9 @@ def test_runs_stay_in_sight_when_their_burst_is_gone(open_dock, run_through, bur
     viewer.layers.clear()
     assert not is_empty(dock)
     dock.picture.runs.remove(run)
-    assert is_empty(dock)
+    assert not is_empty(dock), "it can be brought back"
+    dock.picture.runs.undo_button.click()
+    assert dock.picture.runs.run is run
 
 
 @pytest.fixture

@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 
 # In pitches: where an object travels less (root mean square), registration starts from two places.
 _SHORT_TRAVEL = 0.7
+# Two starts are told apart by the error of a tenth of so many samples; of fewer, drawn anew at most so often.
+_ENOUGH_SAMPLES, _MOST_DRAWS = 40_000, 8
 # Corrections of given gains (root mean square) that are worth a note, and that no bundle needs that was measured well.
 _LARGE_CORRECTION, _ANOTHER_BUNDLE = 0.03, 0.12
 # Part of a normal distribution that lies within one standard deviation.
@@ -237,7 +239,11 @@ class Stages:
         """Return by how much samples that are left out are missed, relative to their mean light."""
         samples = _seen(self._cores(fitted.bundle, self._grey[..., None]), fitted.mount)
         grid = self._scenes.coarse_grid(fitted)
-        return prediction_error(samples, fitted.registration, grid, seed=self._seed)
+        # A tenth of few samples tells little, so several tenths are left out in turn.
+        draws = min(max(1, _ENOUGH_SAMPLES // int((samples.weights > 0).sum())), _MOST_DRAWS)
+        seeds = range(self._seed, self._seed + draws)
+        errors = [prediction_error(samples, fitted.registration, grid, seed=seed) for seed in seeds]
+        return float(np.sqrt(np.mean(np.square(errors))))
 
     def _with_equal_cores(self, fitted: Fitted) -> Fitted:
         """Take all cores as equal: without motion a core's gain cannot be told from what it sees."""

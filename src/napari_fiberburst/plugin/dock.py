@@ -111,10 +111,10 @@ class FiberBurstWidget(QWidget):
             task.setVisible(task is self.tasks[number])
 
     def _show_or_invite(self) -> None:
-        """Show what can be done with a burst, or offer to open one where there is none, and nothing is kept of one."""
-        is_empty = self.input.burst.value is None and all(task.is_empty for task in self.tasks)
-        self.empty.setVisible(is_empty)
-        self.filled.setVisible(not is_empty)
+        """Show what can be done with a burst, and what is kept of runs; offer to open one where there is none."""
+        is_without = self.input.burst.value is None
+        self.empty.setVisible(is_without)
+        self.filled.setVisible(not is_without or not all(task.is_empty for task in self.tasks))
         self.glance.set_brief(is_brief=not self.picture.is_empty)
 
     def _lay_out(self) -> None:
