@@ -26,8 +26,8 @@ from benchmarks.cases import Case
 from benchmarks.unseen import FAULTY_EACH, unseen
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.pipeline import diagnose as judging
+from napari_fiberburst.pipeline.goodness import GoodnessOfFit, collect
 from napari_fiberburst.pipeline.reconstruct import reconstruct
-from napari_fiberburst.pipeline.verdict import GoodnessOfFit, collect
 from napari_fiberburst.quality import match_levels
 from napari_fiberburst.simulation import SimulatedBurst
 

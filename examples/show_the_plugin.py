@@ -76,7 +76,7 @@ class States:
         self.take("compared")
         picture.runs.compare.button.click()
         self.dock.choose_task(BundleTask)
-        self.dock.task.start()
+        self.dock.task.start_button.click()
         wait(lambda: self.dock.input.bundle.value is not None)
         self.take("bundle")
         self.dock.task_bar.setCurrentIndex(0)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
-# Opens the real window on a whole sample; what it does is what tests/plugin/test_window.py asserts.
+# They open the real window on a whole sample; what they do there is asserted by tests/plugin.
 ON_SCREEN = {"record_the_plugin", "show_the_plugin"}
 
 

@@ -8,7 +8,8 @@ import torch
 
 from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.motion.registration import Registration
-from napari_fiberburst.pipeline.verdict import GoodnessOfFit, judge
+from napari_fiberburst.pipeline.goodness import GoodnessOfFit
+from napari_fiberburst.pipeline.verdict import judge
 from napari_fiberburst.simulation import Camera, Faults, simulate
 
 SHAPE = (131, 149)

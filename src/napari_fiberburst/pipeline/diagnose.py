@@ -19,7 +19,8 @@ from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.footprint import Footprint
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.context import frames_behind
-from napari_fiberburst.pipeline.verdict import collect, judge
+from napari_fiberburst.pipeline.goodness import collect
+from napari_fiberburst.pipeline.verdict import is_smeared_far, judge
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.scene.gains import measured_gains
 from napari_fiberburst.scene.prediction import predict
@@ -97,7 +98,7 @@ def diagnose(
     expected = scene.grid.at(_places(canvas, std))(std)
     fit = collect(scene, registration, _variance(noise, bundle, acquisition, registration, samples))
     verdict = judge(fit, registration, bundle.pitch, gains_known=bundle.gains_known)
-    told = () if fit.is_smeared_far(bundle.pitch) else _told(scene.smear)
+    told = () if is_smeared_far(fit, bundle.pitch) else _told(scene.smear)
     return replace(
         found,
         quality=verdict.quality,

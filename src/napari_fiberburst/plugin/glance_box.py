@@ -1,6 +1,6 @@
 """What the burst that is chosen looks like, before it is run: some of its frames, and what is seen of it."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 _HEIGHT, _WIDTH, _MOST = 40, 320, 7
 
 
+# The layers' arrays, why they are no burst, and axes and region of one.
+_Asked = tuple[list[Any], str, Any]
+
+
 class GlanceBox(QWidget):
     """Looks at the burst that is chosen, in another thread, and says what it sees.
 
@@ -41,13 +45,14 @@ class GlanceBox(QWidget):
     def __init__(self, chosen: InputBox, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._input = chosen
-        self._looked_at: object = None
+        self._asked: _Asked | None = None
         self._is_brief = False
         self._said = ""
         self.strip, self.words = QLabel(), QLabel()
         self.strip.setAccessibleName("frames of the burst")
         self.strip.setToolTip("Some frames of the burst.")
         self.words.setWordWrap(True)
+        self.words.setTextFormat(Qt.TextFormat.PlainText)  # with names that users have given
         self.words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.words.setToolTip("What a few frames show; a run measures all of it anew.")
         column = QVBoxLayout(self)
@@ -59,25 +64,28 @@ class GlanceBox(QWidget):
 
     def look(self) -> None:
         """Look at what is chosen now, unless that is what was looked at."""
+        # The layers' own arrays, because what is made of them is another one each time.
+        arrays = [layer.data for layer in self._input.layers]
         try:
-            source = self._input.source()
-            key: object = (*map(id, source.arrays), source.axes, source.region)
+            source: BurstSource | None = self._input.source()
+            problem = ""
         except FiberBurstError as error:
-            source, key = None, str(error)
-        if key == self._looked_at:
+            source, problem = None, str(error)
+        asked = (arrays, problem, source and (source.axes, source.region))
+        if self._asked is not None and _is_same(asked, self._asked):
             return
-        self._looked_at = key
+        self._asked = asked
         self.strip.clear()
         self._show_strip()
         if source is None:
-            self._tell(str(key) if self._input.burst.value is not None else "")
+            self._tell(problem if arrays else "")
             return
         self._said = in_words(source)
         self._tell(self._said)
         create_worker(
             seen_of,
             source,
-            key,
+            asked,
             _connect={"returned": self._take, "errored": self._take_error},
             _ignore_errors=True,
         )
@@ -90,22 +98,27 @@ class GlanceBox(QWidget):
     def _show_strip(self) -> None:
         self.strip.setVisible(not self._is_brief and not self.strip.pixmap().isNull())
 
-    def _take(self, seen: "tuple[object, Glance, NDArray[np.uint8]]") -> None:
-        key, glance, frames = seen
-        if key != self._looked_at:
+    def _take(self, seen: "tuple[_Asked, Glance, NDArray[np.uint8]]") -> None:
+        asked, glance, frames = seen
+        if asked is not self._asked:
             return  # something else was chosen meanwhile
-        self._tell("<br>".join([f"{self._said} · {glance.words}", *glance.warnings]))
+        self._tell(f"{self._said} · {glance.words}", *glance.warnings)
         height, width = frames.shape[:2]
         image = QImage(frames.tobytes(), width, height, 3 * width, QImage.Format.Format_RGB888)
         self.strip.setPixmap(QPixmap.fromImage(image))
         self._show_strip()
 
     def _take_error(self, error: Exception) -> None:
-        self._tell(f"{self._said}<br>The frames cannot be read: {why(error, 'the burst could not be looked at')}")
+        self._tell(self._said, f"The frames cannot be read: {why(error, 'the burst could not be looked at')}")
 
-    def _tell(self, words: str) -> None:
-        self.words.setText(words)
-        self.words.setVisible(bool(words))
+    def _tell(self, *lines: str) -> None:
+        self.words.setText("\n".join(lines))
+        self.words.setVisible(any(lines))
+
+
+def _is_same(one: _Asked, other: _Asked) -> bool:
+    is_of_same = len(one[0]) == len(other[0]) and all(a is b for a, b in zip(one[0], other[0], strict=True))
+    return is_of_same and one[1:] == other[1:]
 
 
 def in_words(source: BurstSource) -> str:
@@ -122,13 +135,13 @@ def in_words(source: BurstSource) -> str:
     return ", ".join(parts)
 
 
-def seen_of(source: BurstSource, key: object) -> "tuple[object, Glance, NDArray[np.uint8]]":
-    """Look at a burst; return the key that it was asked by, what is seen, and thumbnails side by side, (H, W, 3)."""
+def seen_of(source: BurstSource, asked: "_Asked") -> "tuple[_Asked, Glance, NDArray[np.uint8]]":
+    """Look at a burst; return what was asked for, what is seen, and thumbnails side by side, (H, W, 3)."""
     from napari_fiberburst.pipeline.glance import glance, some_of  # torch takes seconds to load
 
     with without_clash():
         burst = source.some(*some_of(*source.shape[:3])).read()
-        return key, glance(burst), _strip(burst.frames)
+        return asked, glance(burst), _strip(burst.frames)
 
 
 def _strip(frames: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -50,7 +50,7 @@ class BundleTask(Task):
         self.keep_button = QPushButton("Keep this bundle…")
         self.words, self.numbers = QLabel(), QLabel()
         self._lay_out()
-        self.start_button.clicked.connect(lambda: self.start())
+        self.start_button.clicked.connect(self.calibrate)
         self.keep_button.clicked.connect(self._ask_and_keep)
         source.changed.connect(self._take_input)
         self._take_input()
@@ -60,7 +60,7 @@ class BundleTask(Task):
         """Whether no bundle is chosen."""
         return self.input.bundle.value is None
 
-    def start(self) -> None:
+    def calibrate(self) -> None:
         """Measure what is chosen, in another thread; then show the bundle and choose it."""
         given = self.input.bundle_source()
         try:

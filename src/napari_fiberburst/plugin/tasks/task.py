@@ -31,7 +31,7 @@ class Task(QWidget):
     title, tip : str
         How the task is called, and what it does.
     start_button : QPushButton
-        Starts it.
+        Starts it, in another thread.
     """
 
     title: ClassVar[str]
@@ -48,11 +48,7 @@ class Task(QWidget):
     @property
     def is_empty(self) -> bool:
         """Whether there is nothing to show of it once the burst is gone."""
-        raise NotImplementedError
-
-    def start(self) -> None:
-        """Do it, in another thread, or say why not."""
-        raise NotImplementedError
+        return True
 
     def open(self) -> None:
         """Follow the viewer, again where the dock was closed."""
