@@ -42,6 +42,15 @@ def compose(
     return matrices / matrices[:, 2:, 2:]
 
 
+def apply(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Map points (..., 2) by a homography; one shared with the solver would hide any error of convention."""
+    x, y = points[..., 0], points[..., 1]
+    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+    mapped_x = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / depth
+    mapped_y = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / depth
+    return np.stack([mapped_x, mapped_y], axis=-1)
+
+
 def brownian_motion(
     frames: int,
     shape: tuple[int, int],

@@ -17,6 +17,10 @@ from napari_fiberburst.errors import SettingsError
 _SPLINE_ORDER: Final = 2
 # How far beyond frame 0's field a scene is kept, in parts of the field; farther out it is its own reflection.
 _MARGIN = 0.5
+# How far a scene is kept beyond frame 0's field, pixels: to the left, above, to the right, and below.
+Reach = tuple[int, int, int, int]
+# Of a drawn scene.
+_MOST_PIXELS = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +76,7 @@ class Scene:
         return [self.image[..., band] for band in range(self.channels)]
 
 
-def make_scene(name: str, shape: tuple[int, int], rng: Generator) -> Scene:
+def make_scene(name: str, shape: tuple[int, int], rng: Generator, reach: Reach | None = None) -> Scene:
     """Return a scene by name, with frame 0's field of `shape` (height, width) at its centre.
 
     Parameters
@@ -83,18 +87,23 @@ def make_scene(name: str, shape: tuple[int, int], rng: Generator) -> Scene:
         Of a frame. Photographs keep their own resolution: a larger frame sees more of them, then reflections.
     rng : numpy.random.Generator
         For what is drawn at random.
+    reach : (int, int, int, int), optional
+        Pixels to the left, above, to the right and below frame 0's field that are to be seen without reflections; the
+        field then lies where a photograph holds all of them. Default, half a frame all round, or less.
 
     Raises
     ------
     SettingsError
-        There is no scene of this name.
+        There is no scene of this name, or the photograph is smaller than its reach.
     """
     if name not in SCENES:
         raise SettingsError(f"unknown scene {name!r}; known: {', '.join(SCENES)}")
-    return SCENES[name](shape, rng)
+    return SCENES[name](shape, rng, reach)
 
 
-def usaf_chart(shape: tuple[int, int], rng: Generator, *, size: float | None = None) -> Scene:
+def usaf_chart(
+    shape: tuple[int, int], rng: Generator, reach: Reach | None = None, *, size: float | None = None
+) -> Scene:
     """Draw a USAF-1951 chart: groups of six elements, each finer by 2^(1/6), dark bars on clear glass.
 
     An element is three horizontal and three vertical bars, five bar widths long, a bar width apart. Groups come in
@@ -106,10 +115,12 @@ def usaf_chart(shape: tuple[int, int], rng: Generator, *, size: float | None = N
         Of a frame.
     rng : numpy.random.Generator
         Not used: a chart is a chart.
+    reach : (int, int, int, int), optional
+        As in `make_scene`.
     size : float, optional
         Side of the chart in pixels; default 0.9 of the frame's shorter side.
     """
-    image, origin = _blank(shape, 1.0)
+    image, origin = _blank(shape, 1.0, reach)
     size = size or 0.9 * min(shape)
     centre_x, centre_y = origin[0] + (shape[1] - 1) / 2, origin[1] + (shape[0] - 1) / 2
     _draw_group_pair(image, centre_x, centre_y, size / _PAIR_SIDE)
@@ -161,9 +172,11 @@ def _darken(image: NDArray[np.float32], left: float, right: float, top: float, b
     image[..., 0] -= np.outer(rows, columns).astype(np.float32)
 
 
-def fibrous_tissue(shape: tuple[int, int], rng: Generator, *, fibres: float = 0.004) -> Scene:
+def fibrous_tissue(
+    shape: tuple[int, int], rng: Generator, reach: Reach | None = None, *, fibres: float = 0.004
+) -> Scene:
     """Draw curved fibres of several widths and colours, bright on dark, `fibres` to a pixel of area."""
-    image, origin = _blank(shape, 0.0)
+    image, origin = _blank(shape, 0.0, reach)
     height, width = image.shape[:2]
     glow = np.zeros((height, width, 3), np.float32)
     colours = np.array([[0.9, 0.5, 0.3], [0.5, 0.9, 0.5], [0.4, 0.6, 1.0]], np.float32)
@@ -180,12 +193,23 @@ def fibrous_tissue(shape: tuple[int, int], rng: Generator, *, fibres: float = 0.
     return Scene((0.04 + 0.92 * (1 - np.exp(-1.6 * glow))).astype(np.float32), origin)
 
 
-def _photograph(load: Callable[[], NDArray[np.uint8]]) -> Callable[[tuple[int, int], Generator], Scene]:
-    def scene(shape: tuple[int, int], rng: Generator) -> Scene:
+def _photograph(load: Callable[[], NDArray[np.uint8]]) -> "SceneMaker":
+    def scene(shape: tuple[int, int], rng: Generator, reach: Reach | None = None) -> Scene:
         image = load()
         starts = [(have - want) / 2 for have, want in zip(image.shape[:2], shape, strict=True)]
         firsts = [max(0, math.floor(start - _MARGIN * want)) for start, want in zip(starts, shape, strict=True)]
         lasts = [math.ceil(start + (1 + _MARGIN) * want) for start, want in zip(starts, shape, strict=True)]
+        if reach is not None:
+            left, above, right, below = reach
+            whole = above + shape[0] + below, left + shape[1] + right
+            firsts = [(have - want) // 2 for have, want in zip(image.shape[:2], whole, strict=True)]
+            if min(firsts) < 0:
+                raise SettingsError(
+                    f"the path needs {whole[0]} x {whole[1]} pixels of the scene, which has {image.shape[0]} x "
+                    f"{image.shape[1]}; take fewer frames, smaller steps, or the scene 'slide', which has no end"
+                )
+            lasts = [first + want for first, want in zip(firsts, whole, strict=True)]
+            starts = [firsts[0] + above, firsts[1] + left]
         part = image[firsts[0] : lasts[0], firsts[1] : lasts[1]]
         y0, x0 = (math.floor(start) - first for start, first in zip(starts, firsts, strict=True))
         return Scene(part.astype(np.float32) / np.float32(255), (x0, y0))
@@ -193,14 +217,21 @@ def _photograph(load: Callable[[], NDArray[np.uint8]]) -> Callable[[tuple[int, i
     return scene
 
 
-def _blank(shape: tuple[int, int], value: float) -> tuple[NDArray[np.float32], tuple[int, int]]:
+def _blank(shape: tuple[int, int], value: float, reach: Reach | None) -> tuple[NDArray[np.float32], tuple[int, int]]:
     """Return an even one-channel image with room around a frame, and where the frame starts in it."""
     margin_y, margin_x = (math.ceil(_MARGIN * side) for side in shape)
-    padded = (shape[0] + 2 * margin_y, shape[1] + 2 * margin_x, 1)
-    return np.full(padded, value, np.float32), (margin_x, margin_y)
+    left, above, right, below = reach or (margin_x, margin_y, margin_x, margin_y)
+    padded = (shape[0] + above + below, shape[1] + left + right, 1)
+    if padded[0] * padded[1] > _MOST_PIXELS:
+        raise SettingsError(
+            f"the path needs {padded[0]} x {padded[1]} pixels of the scene, too large to be drawn at once; take fewer "
+            "frames, smaller steps, or the scene 'slide', which has no end"
+        )
+    return np.full(padded, value, np.float32), (left, above)
 
 
-SCENES: Mapping[str, Callable[[tuple[int, int], Generator], Scene]] = {
+SceneMaker = Callable[[tuple[int, int], Generator, Reach | None], Scene]
+SCENES: Mapping[str, SceneMaker] = {
     "histology": _photograph(skimage.data.immunohistochemistry),
     "retina": _photograph(skimage.data.retina),
     "usaf": usaf_chart,

@@ -14,7 +14,7 @@ from napari_fiberburst.simulation.bundle import Bundle, make_bundle
 from napari_fiberburst.simulation.camera import Camera
 from napari_fiberburst.simulation.faults import Draws, Faults, draw, exposed_over
 from napari_fiberburst.simulation.field import Optics, make_optics
-from napari_fiberburst.simulation.motion import MOTIONS
+from napari_fiberburst.simulation.motion import MOTIONS, apply
 from napari_fiberburst.simulation.relay import (
     Fading,
     Relay,
@@ -30,7 +30,7 @@ PHYSICS = ("mask", "core")
 _BUNDLE_SETTINGS = [item.name for item in signature(make_bundle).parameters.values() if item.kind is item.KEYWORD_ONLY]
 _SHAPE = (256, 256)
 # How bright the intruder and burned-in marks are, in parts of full scale.
-_INTRUDER_LIGHT, _OVERLAY_LIGHT = 0.95, 0.94
+_INTRUDER_LIGHT, OVERLAY_LIGHT = 0.95, 0.94
 # What relays light where the bundle has moved by an offset (x, y), pixels.
 RelayAt = Callable[[NDArray[np.float64]], Relay]
 
@@ -203,8 +203,8 @@ def simulate(
     if physics not in PHYSICS:
         raise SettingsError(f"unknown physics {physics!r}; known: {', '.join(PHYSICS)}")
     size = shape or (_SHAPE if flat is None else np.shape(flat)[:2])
-    _check_numbers(size, frames, channels, seed)
-    _check_bundle(bundle, is_measured=flat is not None)
+    check_numbers(size, frames, channels, seed)
+    check_bundle(bundle, is_measured=flat is not None)
     camera, faults = camera or Camera(), faults or Faults()
     # One generator for each part, so that a change of one leaves the others as they were.
     scene_rng, motion_rng, bundle_rng, camera_rng, faults_rng = np.random.default_rng(seed).spawn(5)
@@ -212,9 +212,9 @@ def simulate(
     world = world.with_channels(world.channels if channels is None else channels)
     homographies = _motion(motion, frames, size, motion_rng)
     if flat is None:
-        relay_at = _designed(make_bundle(size, bundle_rng, **bundle), size, faults.contrast)
+        relay_at = designed(make_bundle(size, bundle_rng, **bundle), size, faults.contrast)
     else:
-        relay_at = _measured(prepared_flat(flat, size, world.channels), faults.contrast, **bundle)
+        relay_at = measured(prepared_flat(flat, size, world.channels), faults.contrast, **bundle)
     relay = relay_at(np.zeros(2))
     optics = make_optics(faults, size, world.channels, is_circle=bundle.get("outline") == "circle")
     draws = draw(faults, frames, optics.field, optics.radius, len(relay.bundle.centres), faults_rng)
@@ -254,7 +254,7 @@ def _look(
     pixels = np.stack([columns, rows], axis=-1)
 
     def points(number: int) -> NDArray[np.float64]:
-        rigid = _apply(homographies[number], pixels)
+        rigid = apply(homographies[number], pixels)
         return rigid if draws.displacement is None else rigid + draws.displacement[number]
 
     truth = np.stack([world.sample(points(number)) for number in range(len(homographies))])
@@ -309,7 +309,7 @@ def _photographed(
     recorded = camera.record(light, rng)
     for number in draws.white:
         recorded[number, optics.field] = camera.full_scale
-    recorded[:, optics.marks] = round(_OVERLAY_LIGHT * camera.full_scale)
+    recorded[:, optics.marks] = round(OVERLAY_LIGHT * camera.full_scale)
     return recorded
 
 
@@ -320,13 +320,13 @@ def _as_burst(recorded: NDArray[Any], white_level: float) -> Burst:
     return Burst(pixels, axes=axes, black_level=0, white_level=white_level)
 
 
-def _designed(bundle: Bundle, shape: tuple[int, int], contrast: float | None) -> RelayAt:
+def designed(bundle: Bundle, shape: tuple[int, int], contrast: float | None) -> RelayAt:
     """Return the relay of a bundle that was laid out."""
     fading = None if contrast is None else Fading.to(contrast, bundle.transmission(shape)[..., None], bundle)
     return lambda offset: relay_of_design(replace(bundle, centres=bundle.centres + offset), shape, fading)
 
 
-def _measured(flat: NDArray[np.float64], contrast: float | None, *, crosstalk: float = 0.0) -> RelayAt:
+def measured(flat: NDArray[np.float64], contrast: float | None, *, crosstalk: float = 0.0) -> RelayAt:
     """Return the relay of a bundle whose flat field (H, W, C) was measured."""
     bundle = find_bundle(flat, crosstalk)
     fading = None if contrast is None else Fading.to(contrast, flat, bundle)
@@ -338,15 +338,6 @@ def _measured(flat: NDArray[np.float64], contrast: float | None, *, crosstalk: f
     return relay_at
 
 
-def _apply(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Map points by a homography; one shared with the solver would hide any error of convention."""
-    x, y = points[..., 0], points[..., 1]
-    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
-    mapped_x = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]) / depth
-    mapped_y = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]) / depth
-    return np.stack([mapped_x, mapped_y], axis=-1)
-
-
 def _motion(
     motion: str | ArrayLike, frames: int, shape: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float64]:
@@ -354,7 +345,18 @@ def _motion(
         if motion not in MOTIONS:
             raise SettingsError(f"unknown motion {motion!r}; known: {', '.join(MOTIONS)}, or homographies (T, 3, 3)")
         return MOTIONS[motion](frames, shape, rng)
-    homographies = np.array(motion, dtype=np.float64)
+    return as_homographies(motion, frames)
+
+
+def as_homographies(given: ArrayLike, frames: int) -> NDArray[np.float64]:
+    """Return homographies (T, 3, 3) that were given as such.
+
+    Raises
+    ------
+    SettingsError
+        They are of another shape, do not begin with the identity, or have no inverse.
+    """
+    homographies = np.array(given, dtype=np.float64)
     if homographies.shape != (frames, 3, 3):
         raise SettingsError(f"homographies must have shape {(frames, 3, 3)}; got {homographies.shape}")
     if not np.allclose(homographies[0], np.eye(3)) or not (np.abs(np.linalg.det(homographies)) > 1e-12).all():
@@ -362,7 +364,8 @@ def _motion(
     return homographies
 
 
-def _check_numbers(shape: tuple[int, int], frames: int, channels: int | None, seed: int) -> None:
+def check_numbers(shape: tuple[int, int], frames: int, channels: int | None, seed: int) -> None:
+    """Refuse sizes and counts that cannot be."""
     wanted = {"frames": (frames, 1), "channels": (1 if channels is None else channels, 1), "seed": (seed, 0)}
     if len(shape) != 2:
         raise SettingsError(f"shape must be (height, width); got {shape}")
@@ -371,7 +374,8 @@ def _check_numbers(shape: tuple[int, int], frames: int, channels: int | None, se
             raise SettingsError(f"{name} must be an integer of at least {least}; got {value!r}")
 
 
-def _check_bundle(bundle: dict[str, Any], *, is_measured: bool) -> None:
+def check_bundle(bundle: dict[str, Any], *, is_measured: bool) -> None:
+    """Refuse settings that a bundle does not have."""
     known = ["crosstalk"] if is_measured else _BUNDLE_SETTINGS
     unknown = sorted(set(bundle) - set(known))
     if unknown:

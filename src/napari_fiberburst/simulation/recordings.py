@@ -1,0 +1,542 @@
+"""Simulated recordings of any length: each frame is made when it is read, and its truth is exact."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from hashlib import sha256
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter
+
+from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.simulation.bundle import Bundle, make_bundle
+from napari_fiberburst.simulation.camera import Camera
+from napari_fiberburst.simulation.events import (
+    Bending,
+    Cells,
+    cut,
+    draw_bending,
+    draw_cells,
+    draw_cuts,
+    draw_exposures,
+    draw_lifts,
+)
+from napari_fiberburst.simulation.faults import Faults
+from napari_fiberburst.simulation.field import Optics, make_optics
+from napari_fiberburst.simulation.motion import apply
+from napari_fiberburst.simulation.paths import PATHS, follow
+from napari_fiberburst.simulation.relay import Relay, prepared_flat
+from napari_fiberburst.simulation.scenes import Reach, Scene, make_scene
+from napari_fiberburst.simulation.simulate import (
+    OVERLAY_LIGHT,
+    as_homographies,
+    check_bundle,
+    check_numbers,
+    designed,
+    measured,
+)
+from napari_fiberburst.simulation.slide import Slide
+
+# As in `simulate`, and as a vendor's display shows it: with the cores filtered out.
+RECORDED_PHYSICS = ("core", "mask", "filtered")
+_SHAPE, _FRAMES, _PITCH = (256, 256), 400, 4.7
+# The default step, in parts of the frame's shorter side.
+_STEP = 0.035
+# How far a lifted probe's picture is blurred where no light comes back any more, pitches.
+_BLUR = 4.0
+# The filter that takes the cores out of a frame, in pitches, and the least light of the bundle that it divides by.
+_FILTER, _LEAST_LIGHT = 0.5, 0.05
+# Radius of a cell, in pitches.
+_CELL_RADIUS = 0.75
+# How far a spline sees beyond where it is sampled.
+_SPLINE_REACH = 3
+_STRIP = 128
+
+
+class World(Protocol):
+    """What there is to see, such as a `Scene` or a `Slide`."""
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+
+    def sample(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Return it (..., C) at frame-0 points (..., 2)."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SimulatedRecording:
+    """A recording and the truth behind it.
+
+    Attributes
+    ----------
+    source : FrameSource
+        The frames. Its reader makes each when it is read, to the same bits in any order and in any process.
+    homographies : numpy.ndarray
+        (T, 3, 3) float64, frame-t pixel to frame-0 pixel, [0] the identity.
+    in_contact : numpy.ndarray
+        (T,) bool: the probe touches the tissue. Elsewhere a frame is blurred and dim, or black.
+    cuts : numpy.ndarray
+        Numbers of the frames that show another place than the one before them.
+    exposures : numpy.ndarray
+        (T,) float64: what the light of each frame is multiplied by, geometric mean 1.
+    cells : numpy.ndarray
+        (M, 2) float64 as (x, y): where in frame-0 pixels cells blink.
+    traces : numpy.ndarray
+        (T, M) float32: the light that each cell adds to the scene in each frame, in parts of full scale.
+    cell_radius : float
+        Of a cell, pixels.
+    transmission : numpy.ndarray
+        (H, W) float64: what the camera sees of an even white scene, the mean of the channels.
+    bundle : Bundle
+        The cores.
+    world : World
+        The object, wherever the path leads.
+    bounds : (float, float, float, float)
+        x0, y0, x1, y1 in frame-0 pixels, half-open: what the frames see, all together.
+    visible : numpy.ndarray or None
+        (H, W) bool: inside the field and not under a burned-in mark; None where the whole frame is.
+    """
+
+    source: FrameSource
+    homographies: NDArray[np.float64]
+    in_contact: NDArray[np.bool_]
+    cuts: NDArray[np.intp]
+    exposures: NDArray[np.float64]
+    cells: NDArray[np.float64]
+    traces: NDArray[np.float32]
+    cell_radius: float
+    transmission: NDArray[np.float64]
+    bundle: Bundle
+    world: World
+    bounds: tuple[float, float, float, float]
+    visible: NDArray[np.bool_] | None
+    _views: "_Views"
+
+    def truth(self, numbers: Sequence[int]) -> NDArray[np.float32]:
+        """Return what the pixels of some frames look at (n, H, W, C): bent tissue, and cells as they blink.
+
+        It is as it would be in contact, without bundle, exposure, marks and noise.
+        """
+        pixels = _pixels((self.source.shape[1], self.source.shape[2]))
+        return np.stack([self._views.look(number, pixels) for number in numbers])
+
+    def displacement(self, number: int) -> NDArray[np.float32] | None:
+        """Return how far tissue is bent in a frame, (H, W, 2) as (x, y) in pixels; None where it does not bend.
+
+        The pixel x of frame t looks at the point ``homographies[t](x) + displacement(t)(x)`` of frame 0.
+        """
+        bending = self._views.bending
+        if bending is None:
+            return None
+        return bending.at(
+            number, apply(self.homographies[number], _pixels((self.source.shape[1], self.source.shape[2])))
+        )
+
+    def picture(self, bounds: tuple[float, float, float, float], spacing: float = 1.0) -> NDArray[np.float32]:
+        """Return the object itself (H', W', C), at rest and without cells.
+
+        Parameters
+        ----------
+        bounds : (float, float, float, float)
+            x0, y0, x1, y1 in frame-0 pixels, half-open: (0, 0, W, H) is frame 0's field.
+        spacing : float
+            Frame-0 pixels from one pixel of the picture to the next.
+
+        Raises
+        ------
+        SettingsError
+            The bounds are empty or the spacing is not positive.
+        """
+        x0, y0, x1, y1 = bounds
+        if not (x0 < x1 and y0 < y1 and spacing > 0):
+            raise SettingsError(f"a picture needs x0 < x1, y0 < y1 and a spacing above 0; got {bounds} and {spacing!r}")
+        x, y = (
+            start - 0.5 + spacing * (np.arange(max(1, round((stop - start) / spacing))) + 0.5)
+            for start, stop in ((x0, x1), (y0, y1))
+        )
+        strips = [
+            self.world.sample(np.stack(np.meshgrid(x, y[first : first + _STRIP]), axis=-1))
+            for first in range(0, len(y), _STRIP)
+        ]
+        return np.concatenate(strips)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the truth that can be written beside the frames, as ``fiberburst simulate --recording`` does."""
+        names = ("homographies", "in_contact", "cuts", "exposures", "cells", "traces", "transmission")
+        return {name: getattr(self, name) for name in names} | {"core_centres": self.bundle.centres}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Views:
+    """What frames look at."""
+
+    world: World
+    homographies: NDArray[np.float64]
+    bending: Bending | None
+    cells: Cells | None
+
+    def look(self, number: int, pixels: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return what pixels (..., 2) of a frame look at, (..., C)."""
+        points = apply(self.homographies[number], pixels)
+        if self.bending is not None:
+            points = points + self.bending.at(number, points)
+        seen = self.world.sample(points)
+        return seen if self.cells is None else seen + self.cells.light(number, points)[..., None]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Simulator:
+    """Makes frames of a recording when they are read."""
+
+    views: _Views
+    relay: Relay
+    optics: Optics
+    physics: str
+    camera: Camera
+    exposures: NDArray[np.float64]
+    lifts: NDArray[np.float32]
+    channels: int
+    seed: int
+
+    def __call__(self, numbers: Sequence[int]) -> NDArray[np.generic]:
+        """Return frames by their numbers, (n, H, W, C)."""
+        frames = [self._frame(int(number)) for number in numbers]
+        if not frames:
+            return np.zeros((0, *self._shape, self.channels), np.uint8 if self.camera.bits == 8 else np.uint16)
+        return np.stack(frames)
+
+    def _frame(self, number: int) -> NDArray[np.generic]:
+        seen = self._seen(number)
+        flat = self.relay.flat.astype(np.float32)
+        light = seen * flat if self.physics == "mask" else self.relay.through(seen)
+        light = light * np.float32(self.exposures[number])
+        if self.optics.shading is not None:
+            light = light * self.optics.shading
+        recorded = self.camera.record(light, np.random.default_rng((self.seed, number)))
+        if self.physics == "filtered":
+            recorded = self._without_cores(recorded)
+        recorded[self.optics.marks] = round(OVERLAY_LIGHT * self.camera.full_scale)
+        return recorded
+
+    def _seen(self, number: int) -> NDArray[np.float32]:
+        """Return what the bundle's end sees (H, W, C)."""
+        lift = self.lifts[number]
+        if lift == 1:
+            return np.zeros((*self._shape, self.channels), np.float32)
+        if lift > 0:
+            sigma = float(_BLUR * self.relay.bundle.pitch * lift)
+            blurred = gaussian_filter(self.views.look(number, _pixels(self._shape)), (sigma, sigma, 0))
+            return np.float32((1 - lift) ** 2) * blurred
+        return self.views.look(number, _pixels(self._shape))
+
+    def _without_cores(self, recorded: NDArray[Any]) -> NDArray[Any]:
+        """Return a frame (H, W, C) as vendors show it: smoothed, and divided by the bundle's light."""
+        sigma = _FILTER * self.relay.bundle.pitch
+        dark = self.camera.pedestal * self.camera.full_scale
+        smooth = gaussian_filter(recorded.astype(np.float32) - np.float32(dark), (sigma, sigma, 0))
+        shown = np.where(self._filtered_flat > _LEAST_LIGHT, smooth / np.maximum(self._filtered_flat, _LEAST_LIGHT), 0)
+        shown = np.where(self.optics.field[..., None], shown, 0) + dark
+        frame: NDArray[Any] = np.clip(np.rint(shown), 0, self.camera.full_scale).astype(recorded.dtype)
+        return frame
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.relay.flat.shape[0], self.relay.flat.shape[1]
+
+    @cached_property
+    def _filtered_flat(self) -> NDArray[np.float32]:
+        sigma = _FILTER * self.relay.bundle.pitch
+        return gaussian_filter(self.relay.flat, (sigma, sigma, 0)).astype(np.float32)
+
+
+def simulate_recording(
+    scene: str | World = "slide",
+    *,
+    frames: int | None = None,
+    shape: tuple[int, int] | None = None,
+    channels: int = 1,
+    path: str | ArrayLike = "raster",
+    step: float | None = None,
+    laps: int = 1,
+    turn: float = 0.0,
+    zoom: float = 0.0,
+    gaps: int = 0,
+    gap_frames: int = 12,
+    jumps: int = 0,
+    jump: float | None = None,
+    bending: float = 0.0,
+    flicker: float = 0.0,
+    drift: float = 0.0,
+    cells: int = 0,
+    flash: float = 0.3,
+    flash_frames: int = 3,
+    field: float | None = None,
+    overlay: bool = False,
+    vignette: float = 1.0,
+    physics: str = "core",
+    camera: Camera | None = None,
+    flat: ArrayLike | None = None,
+    rate: float = 25.0,
+    seed: int = 0,
+    **bundle: Any,
+) -> SimulatedRecording:
+    """Simulate a recording of any length, of which each frame is made when it is read.
+
+    Parameters
+    ----------
+    scene : str or World
+        "slide", drawn tissue without end; one of `SCENES`, as far as it reaches; or a scene of your own.
+    frames : int, optional
+        T. Default 400, or as many as `path` has homographies.
+    shape : (int, int), optional
+        Height and width of a frame. Default 256 x 256, or all of `flat`.
+    channels : int
+        1 is grey; others are bands spread over the scene's spectrum.
+    path : str or array_like
+        "raster", "spiral", "handheld", or homographies (T, 3, 3), frame-t pixel to frame-0 pixel.
+    step : float, optional
+        Pixels from frame to frame. Default, 0.035 of the frame's shorter side.
+    laps : int
+        How many times the path is gone: forth, back, forth and so on.
+    turn : float
+        Degrees by which the probe turns at most, on the way.
+    zoom : float
+        The same of the magnification, relative: 0.02 is two per cent.
+    gaps, gap_frames : int
+        How often the probe loses contact, and for how many frames: it is lifted, sees nothing, and comes back.
+    jumps : int
+        How often the recording is cut, and goes on at another place.
+    jump : float, optional
+        How far away that is, pixels. Default, 1.2 of the frame's longer side, so that nothing is seen in both frames.
+    bending : float
+        By how much tissue bends over the recording, pixels root mean square where it is most; frame 0 is at rest.
+    flicker : float
+        Relative standard deviation of the exposures from frame to frame.
+    drift : float
+        By how much the light changes slowly, relative, at most.
+    cells : int
+        How many cells blink at places that the probe passes, discs of 1.5 pitches across.
+    flash : float
+        The light of a flash, in parts of full scale, which is added to the scene's.
+    flash_frames : int
+        Frames of a flash.
+    field, overlay, vignette
+        A round field, burned-in marks, darkening to the rim: as in `Faults`.
+    physics : str
+        "core" and "mask" as in `simulate`; "filtered" is "core" as vendors show it, with the core pattern filtered out.
+    camera : Camera, optional
+        Default, 8 bits with one per cent of noise at full scale.
+    flat : array_like, optional
+        As in `simulate`.
+    rate : float
+        Frames per second.
+    seed : int
+        The same seed gives the same recording.
+    **bundle
+        As in `simulate`; ``pitch`` is 4.7 by default.
+
+    Returns
+    -------
+    SimulatedRecording
+
+    Raises
+    ------
+    SettingsError
+        An unknown scene, path or physics, a value out of range, or a path that leads out of the scene.
+    """
+    if physics not in RECORDED_PHYSICS:
+        raise SettingsError(f"unknown physics {physics!r}; known: {', '.join(RECORDED_PHYSICS)}")
+    size = shape or (_SHAPE if flat is None else (np.shape(flat)[0], np.shape(flat)[1]))
+    count = frames if frames is not None else (_FRAMES if isinstance(path, str) else len(np.asarray(path)))
+    check_numbers(size, count, channels, seed)
+    check_bundle(bundle, is_measured=flat is not None)
+    _check_amounts(
+        step=step, laps=laps, turn=turn, zoom=zoom, gaps=gaps, gap_frames=gap_frames, jumps=jumps, jump=jump,
+        bending=bending, drift=drift, cells=cells, flash=flash, flash_frames=flash_frames, rate=rate,
+    )  # fmt: skip
+    camera = camera or Camera()
+    faults = Faults(flicker=flicker, field=field, overlay=overlay, vignette=vignette)
+    # The first five as in `simulate`, so that the same seed lays out the same bundle.
+    scene_rng, path_rng, bundle_rng, camera_rng, event_rng = np.random.default_rng(seed).spawn(5)
+    jump_rng, contact_rng, light_rng, bend_rng, cell_rng = event_rng.spawn(5)
+    cuts = draw_cuts(count, jumps, jump_rng)
+    homographies = cut(
+        _path(path, count, size, path_rng, step=step, laps=laps, turn=turn, zoom=zoom),
+        cuts,
+        1.2 * max(size) if jump is None else jump,
+        jump_rng,
+    )
+    bent = draw_bending(count, bending, size, bend_rng)
+    bounds = _bounds(homographies, size, 0.0 if bent is None else bent.most)
+    world = _world(scene, size, channels, bounds, scene_rng)
+    if flat is None:
+        relay = designed(make_bundle(size, bundle_rng, **{"pitch": _PITCH, **bundle}), size, None)(np.zeros(2))
+    else:
+        relay = measured(prepared_flat(flat, size, channels), None, **bundle)(np.zeros(2))
+    optics = make_optics(faults, size, channels, is_circle=bundle.get("outline") == "circle")
+    blinking = draw_cells(
+        cells, homographies, size, cell_rng, radius=_CELL_RADIUS * relay.bundle.pitch, flash=flash, length=flash_frames
+    )
+    views = _Views(world=world, homographies=homographies, bending=bent, cells=blinking)
+    simulator = _Simulator(
+        views=views,
+        relay=relay,
+        optics=optics,
+        physics=physics,
+        camera=camera,
+        exposures=draw_exposures(count, flicker, drift, light_rng),
+        lifts=draw_lifts(count, gaps, gap_frames, contact_rng),
+        channels=channels,
+        seed=int(camera_rng.integers(2**63)),
+    )
+    return _recording(simulator, cuts, bounds, rate, scene if isinstance(scene, str) else type(scene).__name__, path)
+
+
+def _recording(
+    simulator: _Simulator,
+    cuts: NDArray[np.intp],
+    bounds: tuple[float, float, float, float],
+    rate: float,
+    scene: str,
+    path: str | ArrayLike,
+) -> SimulatedRecording:
+    """Return a recording of what a simulator makes."""
+    views, relay, optics = simulator.views, simulator.relay, simulator.optics
+    count, channels = len(views.homographies), simulator.channels
+    first = simulator([0])
+    acquisition = Acquisition(
+        shape=(count, *first.shape[1:3], channels),
+        axes="TYX" if channels == 1 else "TYXC",
+        dtype=first.dtype,
+        black_level=0.0,
+        white_level=float(simulator.camera.full_scale),
+        times=np.arange(count) / rate,
+    )
+    seen = np.ones_like(relay.flat) if simulator.physics == "filtered" else relay.flat
+    if simulator.physics == "filtered":
+        seen = seen * optics.field[..., None]
+    cells = views.cells
+    return SimulatedRecording(
+        source=FrameSource(
+            acquisition=acquisition,
+            reader=simulator,
+            name=f"simulated {scene}, {path if isinstance(path, str) else 'path given'}",
+            fingerprint=_fingerprint(simulator, first, rate),
+        ),
+        homographies=views.homographies,
+        in_contact=simulator.lifts == 0,
+        cuts=cuts,
+        exposures=simulator.exposures,
+        cells=np.zeros((0, 2)) if cells is None else cells.places,
+        traces=np.zeros((count, 0), np.float32) if cells is None else cells.traces,
+        cell_radius=_CELL_RADIUS * relay.bundle.pitch,
+        transmission=(seen if optics.shading is None else seen * optics.shading).mean(axis=2),
+        bundle=relay.bundle,
+        world=views.world,
+        bounds=bounds,
+        visible=optics.visible,
+        _views=views,
+    )
+
+
+def _path(
+    path: str | ArrayLike,
+    frames: int,
+    shape: tuple[int, int],
+    rng: np.random.Generator,
+    *,
+    step: float | None,
+    laps: int,
+    turn: float,
+    zoom: float,
+) -> NDArray[np.float64]:
+    if isinstance(path, str):
+        if path not in PATHS:
+            raise SettingsError(f"unknown path {path!r}; known: {', '.join(PATHS)}, or homographies (T, 3, 3)")
+        step = _STEP * min(shape) if step is None else step
+        return follow(path, frames, shape, rng, step=step, laps=laps, turn=turn, zoom=zoom)
+    if (laps, turn, zoom, step) != (1, 0, 0, None):
+        raise SettingsError("step, laps, turn and zoom are of named paths; homographies hold all of the motion")
+    return as_homographies(path, frames)
+
+
+def _bounds(
+    homographies: NDArray[np.float64], shape: tuple[int, int], bending: float
+) -> tuple[float, float, float, float]:
+    """Return x0, y0, x1, y1 of all that frames look at, half-open."""
+    height, width = shape
+    corners = np.array([[x, y, 1.0] for x in (-0.5, width - 0.5) for y in (-0.5, height - 0.5)])
+    mapped = homographies @ corners.T
+    if (mapped[:, 2] <= 0).any():
+        raise SettingsError("homographies must keep frames whole; one of them maps a part of the frame to infinity")
+    points = mapped[:, :2] / mapped[:, 2:]
+    low, high = points.min(axis=(0, 2)) - bending, points.max(axis=(0, 2)) + bending
+    return float(low[0]) + 0.5, float(low[1]) + 0.5, float(high[0]) + 0.5, float(high[1]) + 0.5
+
+
+def _world(
+    scene: str | World,
+    shape: tuple[int, int],
+    channels: int,
+    bounds: tuple[float, float, float, float],
+    rng: np.random.Generator,
+) -> World:
+    """Return what there is to see within these bounds, in so many channels."""
+    if scene == "slide":
+        return Slide(seed=int(rng.integers(2**31)), channels=channels)
+    x0, y0, x1, y1 = bounds
+    if isinstance(scene, str):
+        before = [max(0, math.ceil(-edge)) + _SPLINE_REACH for edge in (x0, y0)]
+        after = [max(0, math.ceil(edge - side)) + _SPLINE_REACH for edge, side in ((x1, shape[1]), (y1, shape[0]))]
+        reach: Reach = (before[0], before[1], after[0], after[1])
+        return make_scene(scene, shape, rng, reach).with_channels(channels)
+    if isinstance(scene, Scene):
+        height, width = scene.image.shape[:2]
+        left, top = (start + edge for start, edge in zip(scene.origin, (x0, y0), strict=True))
+        right, bottom = scene.origin[0] + x1, scene.origin[1] + y1
+        if min(left, top) < 0 or right > width or bottom > height:
+            raise SettingsError(
+                f"the path needs the scene's columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}, but "
+                f"it has {height} x {width} pixels; take fewer frames, smaller steps, or the scene 'slide'"
+            )
+        return scene.with_channels(channels)
+    if scene.channels != channels:
+        raise SettingsError(f"the scene has {scene.channels} channels; got channels={channels}")
+    return scene
+
+
+def _check_amounts(**amounts: float | None) -> None:
+    for name, value in amounts.items():
+        least = {"laps": 1, "gap_frames": 1, "flash_frames": 1}.get(name, 0)
+        if value is not None and (isinstance(value, str) or not least <= value < math.inf):
+            raise SettingsError(f"{name} must be a number of at least {least}; got {value!r}")
+    if amounts["rate"] == 0:
+        raise SettingsError("rate must be above 0 frames a second; got 0")
+
+
+def _fingerprint(simulator: _Simulator, first: NDArray[np.generic], rate: float) -> str:
+    """Return what differs where any frame does: hashed are all numbers that frames are made of, and frame 0."""
+    views = simulator.views
+    parts = [first, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
+    parts += [] if views.cells is None else [views.cells.places, views.cells.traces]
+    parts += [] if views.bending is None else [views.bending.waves, views.bending.courses]
+    digest = sha256(repr((simulator.camera, simulator.physics, simulator.seed, rate)).encode())
+    for part in parts:
+        digest.update(np.ascontiguousarray(part).tobytes())
+    return digest.hexdigest()
+
+
+@lru_cache(maxsize=4)
+def _pixels(shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the pixels of a frame, (H, W, 2) as (x, y)."""
+    rows, columns = np.indices(shape, dtype=np.float64)
+    pixels = np.stack([columns, rows], axis=-1)
+    pixels.flags.writeable = False  # it is shared
+    return pixels
