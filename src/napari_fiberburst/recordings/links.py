@@ -1,7 +1,8 @@
 """How one frame of a recording lies on another: similarities between pairs of frames, each with how alike they are."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from napari_fiberburst.motion.correlation import OverlapCorrelation
 from napari_fiberburst.recordings.views import Views
+from napari_fiberburst.stored import Stored
 
 # Pairs that are less alike than this do not show the same place.
 LEAST_ALIKE = 0.35
@@ -31,7 +33,7 @@ Pair = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Links:
+class Links(Stored):
     """Pairs of frames that show the same place.
 
     Attributes
@@ -48,7 +50,9 @@ class Links:
         (L,) correlation of what both see, 0 to 1.
     """
 
-    pairs: NDArray[np.intp]
+    _kind: ClassVar[str] = "set of links"
+
+    pairs: NDArray[np.int64]
     similarity: NDArray[np.float64]
     middle: NDArray[np.float64]
     reach: NDArray[np.float64]
@@ -62,13 +66,11 @@ class Links:
         """Return no links."""
         two = np.zeros((0, 2))
         return cls(
-            pairs=np.zeros((0, 2), np.intp), similarity=np.zeros((0, 4)), middle=two, reach=two, alike=np.zeros(0)
+            pairs=np.zeros((0, 2), np.int64), similarity=np.zeros((0, 4)), middle=two, reach=two, alike=np.zeros(0)
         )
 
     def __add__(self, other: "Links") -> "Links":
-        return Links(
-            **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in Links.__dataclass_fields__}
-        )
+        return Links(**{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _NAMES})
 
     def is_near(self, expected: NDArray[np.float64], radius: float) -> NDArray[np.bool_]:
         """Return which links (L,) are about as expected (L, 4): shifted by no more than a radius, hardly turned."""
@@ -78,7 +80,10 @@ class Links:
 
     def where(self, chosen: NDArray[np.bool_]) -> "Links":
         """Return some of the links."""
-        return Links(**{name: getattr(self, name)[chosen] for name in Links.__dataclass_fields__})
+        return Links(**{name: getattr(self, name)[chosen] for name in _NAMES})
+
+
+_NAMES = tuple(item.name for item in fields(Links))
 
 
 class Linker:
@@ -136,9 +141,9 @@ class Linker:
                 start[2:] = shift * self._views.spacing
                 kept.append(pair)
                 starts.append(start)
-        starts = np.reshape(starts, (-1, 4))
-        links = self._refined(kept, starts)
-        return links.where((links.alike >= LEAST_ALIKE) & links.is_near(starts, self._half * self._views.spacing / 4))
+        at = np.reshape(np.array(starts, dtype=np.float64), (-1, 4))
+        links = self._refined(kept, at)
+        return links.where((links.alike >= LEAST_ALIKE) & links.is_near(at, self._half * self._views.spacing / 4))
 
     def _refined(self, pairs: Sequence[Pair], starts: NDArray[np.float64]) -> Links:
         found = Links.none()
@@ -172,7 +177,7 @@ class Linker:
         middle = (weight @ places.T) / mass
         spread = (weight @ places.square().T) / mass - middle.square()
         return Links(
-            pairs=np.array(pairs, dtype=np.intp).reshape(-1, 2),
+            pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
             similarity=similarity.double().numpy() * unit,
             middle=middle.double().numpy() * unit[2:],
             reach=spread.clamp_min(0).sqrt().double().numpy() * unit[2:],
@@ -227,7 +232,7 @@ def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> Tensor:
     return (weight * first * second).sum(dim=1) / power.sqrt().clamp_min(1e-9)
 
 
-def neighbours(frames: NDArray[np.intp], gaps: Sequence[int]) -> Iterator[Pair]:
+def neighbours(frames: NDArray[np.int64], gaps: Sequence[int]) -> Iterator[Pair]:
     """Return pairs of frames that lie so many places apart in a list of frames."""
     for gap in gaps:
         yield from zip(frames[:-gap].tolist(), frames[gap:].tolist(), strict=True)

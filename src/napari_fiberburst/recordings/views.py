@@ -14,8 +14,6 @@ _CELL, _MOST_SIDE = 0.43, 192
 _SMOOTHED, _NEIGHBOURHOOD = 0.55, 2.2
 # So many images are kept.
 _KEPT = 512
-# Frames whose mean light is told from at most so many.
-_FRAMES_OF_MEAN = 2000
 
 
 class Views:
@@ -35,25 +33,15 @@ class Views:
     def __init__(self, traces: Traces) -> None:
         self._traces = traces
         template = traces.template
-        height, width = template.shape
-        self.spacing = max(_CELL * template.pitch, max(height, width) / _MOST_SIDE)
-        self._grid = Grid.over((0, 0, width - 1, height - 1), self.spacing)
-        self.shape = self._grid.shape
-        shown = traces.shows.nonzero()[0]
-        samples = traces.samples(shown[:: max(1, len(shown) // _FRAMES_OF_MEAN)])
-        self.mean_light = (samples.grey * samples.weights).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
+        self._grid = grid_of(template.shape, template.pitch)
+        self.spacing, self.shape = self._grid.spacing, self._grid.shape
+        self._mean_light = traces.summary.mean_light
         self.at = lru_cache(maxsize=_KEPT)(self._make)
-
-    @property
-    def middle(self) -> tuple[float, float]:
-        """The middle of an image (x, y), frame pixels."""
-        rows, columns = self.shape
-        return self._grid.x0 + (columns - 1) / 2 * self.spacing, self._grid.y0 + (rows - 1) / 2 * self.spacing
 
     def _make(self, number: int) -> tuple[Tensor, Tensor]:
         samples = self._traces.samples([number])
-        relative = samples.grey / self.mean_light.clamp_min(1e-4)
-        weights = samples.weights * (self.mean_light > 1e-4)
+        relative = samples.grey / self._mean_light.clamp_min(1e-4)
+        weights = samples.weights * (self._mean_light > 1e-4)
         pitch = samples.pitch / self.spacing
         images, mask = even_images(
             samples.positions,
@@ -64,3 +52,16 @@ class Views:
             neighbourhood=max(2.0, _NEIGHBOURHOOD * pitch),
         )
         return images[0], mask[0]
+
+
+def grid_of(shape: tuple[int, int], pitch: float) -> Grid:
+    """Return the cells of the images of frames (height, width) of a bundle, in frame pixels."""
+    height, width = shape
+    return Grid.over((0, 0, width - 1, height - 1), max(_CELL * pitch, max(height, width) / _MOST_SIDE))
+
+
+def middle_of(shape: tuple[int, int], pitch: float) -> tuple[float, float]:
+    """Return the middle of the images (x, y), frame pixels: links and poses are about it."""
+    grid = grid_of(shape, pitch)
+    rows, columns = grid.shape
+    return grid.x0 + (columns - 1) / 2 * grid.spacing, grid.y0 + (rows - 1) / 2 * grid.spacing
