@@ -183,10 +183,15 @@ def _encode(output: Any, source: FrameSource, codec: _Codec, shown: "_Times", on
     _, height, width, channels = source.shape
     depth = 2 if (channels, 2) in codec.layouts and source.acquisition.dtype.itemsize > 1 else 1
     even = 2 if codec.layouts[channels, depth] == "yuv420p" else 1
-    stream = output.add_stream(codec.library, rate=shown.rate, options=codec.options)
-    stream.width, stream.height = -(-width // even) * even, -(-height // even) * even
-    stream.pix_fmt = codec.layouts[channels, depth]
-    stream.codec_context.time_base = shown.unit
+    stream = output.add_stream(
+        codec.library,
+        rate=shown.rate,
+        options=codec.options,
+        width=-(-width // even) * even,
+        height=-(-height // even) * even,
+        pix_fmt=codec.layouts[channels, depth],
+        time_base=shown.unit,
+    )
     for number in range(len(source)):
         values = _padded(_as_integers(source, number, depth), even)
         frame = av.VideoFrame.from_ndarray(values, format=_LAYOUTS[channels, depth])

@@ -417,16 +417,17 @@ def _recording(
 ) -> SimulatedRecording:
     """Return a recording of what a simulator makes."""
     views, relay, optics = simulator.views, simulator.relay, simulator.optics
-    count, first = len(views.homographies), simulator([0])
+    count = len(views.homographies)
+    some = simulator([0, count // 2, count - 1])
     acquisition = Acquisition(
-        shape=(count, *first.shape[1:3], simulator.channels),
+        shape=(count, *some.shape[1:3], simulator.channels),
         axes="TYX" if simulator.channels == 1 else "TYXC",
-        dtype=first.dtype,
+        dtype=some.dtype,
         black_level=0.0,
         white_level=float(simulator.camera.full_scale),
         times=np.arange(count) / rate,
     )
-    fingerprint = _fingerprint(simulator, first, rate)
+    fingerprint = _fingerprint(simulator, some, rate)
     is_filtered = simulator.physics == "filtered"
     flat = np.where(optics.field[..., None], 1.0, 0.0) if is_filtered else relay.flat
     return SimulatedRecording(
@@ -528,10 +529,10 @@ def _check_amounts(**amounts: float | None) -> None:
         raise SettingsError("rate must be above 0 frames per second; got 0")
 
 
-def _fingerprint(simulator: _Simulator, first: NDArray[np.generic], rate: float) -> str:
-    """Return what differs where any frame does: hashed are all numbers that frames are made of, and frame 0."""
+def _fingerprint(simulator: _Simulator, some: NDArray[np.generic], rate: float) -> str:
+    """Return what differs where any frame does: of all numbers that frames are made of, and of some frames."""
     views = simulator.views
-    parts = [first, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
+    parts = [some, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
     parts += [] if views.cells is None else [views.cells.places, views.cells.traces]
     parts += [] if views.bending is None else [views.bending.waves, views.bending.courses]
     digest = sha256(repr((simulator.camera, simulator.physics, simulator.seed, rate)).encode())
@@ -545,5 +546,5 @@ def _pixels(shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the pixels of a frame, (H, W, 2) as (x, y)."""
     rows, columns = np.indices(shape, dtype=np.float64)
     pixels = np.stack([columns, rows], axis=-1)
-    pixels.flags.writeable = False  # it is shared
+    pixels.setflags(write=False)  # it is shared
     return pixels
