@@ -90,10 +90,15 @@ def assigns_to_another(path: Path) -> set[str]:
 
 
 def test_nothing_outside_pipeline_and_plugin_reassigns_another_objects_attribute():
-    """The steps exchange frozen values: whoever holds one can rely on it. The command line sets tqdm's totals."""
+    """The steps exchange frozen values: whoever holds one can rely on it.
+
+    The command line sets tqdm's totals, and FFmpeg is told the number of a packet in the place of its time.
+    """
+    allowed = {"io/video_container.py": {"packet.pts", "packet.dts"}}
     for part, path in files():
         if part not in {"pipeline", "plugin", "cli"}:
-            assert not assigns_to_another(path), f"{path} assigns to {assigns_to_another(path)}"
+            others = assigns_to_another(path) - allowed.get(path.relative_to(ROOT).as_posix(), set())
+            assert not others, f"{path} assigns to {others}"
 
 
 def test_a_reassigned_attribute_is_noticed(tmp_path):

@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from napari_fiberburst.bundle.samples import sample as sample
     from napari_fiberburst.control import Control as Control
     from napari_fiberburst.data.burst import Burst as Burst
+    from napari_fiberburst.data.source import FrameSource as FrameSource
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
+    from napari_fiberburst.io import find_doubled as find_doubled
+    from napari_fiberburst.io import open_recording as open_recording
     from napari_fiberburst.io import read_burst as read_burst
     from napari_fiberburst.motion.register import refine as refine
     from napari_fiberburst.motion.register import register as register
@@ -45,6 +48,7 @@ _HOMES = {
     "Control": "control",
     "Diagnostics": "results.diagnostics",
     "FiberBurstError": "errors",
+    "FrameSource": "data.source",
     "Progress": "results.progress",
     "Reconstruction": "results.reconstruction",
     "Registration": "motion.registration",
@@ -53,9 +57,11 @@ _HOMES = {
     "Settings": "settings",
     "calibrate": "bundle.calibrate",
     "diagnose": "pipeline.diagnose",
+    "find_doubled": "io",
     "flatten": "pipeline.remeasure",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
+    "open_recording": "io",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
     "refine": "motion.register",
