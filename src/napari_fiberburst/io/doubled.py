@@ -22,6 +22,9 @@ def find_doubled(source: FrameSource) -> NDArray[np.int64]:
     may have changed, is doubled too where it differs from the frame before by less than one grey level (rms) and less
     than a tenth of what the frames around it differ by.
 
+    A codec that writes most frames as changes of others may write a doubled frame anew, as a key frame, which is not
+    found then; and of an object that stands still it may write no change at all, which is found as doubled.
+
     Parameters
     ----------
     source : FrameSource
