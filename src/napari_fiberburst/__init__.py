@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.motion.register import register as register
     from napari_fiberburst.motion.registration import Registration as Registration
     from napari_fiberburst.networks.image import load as load
+    from napari_fiberburst.pipeline.choose import best_burst as best_burst
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
@@ -55,6 +56,7 @@ _HOMES = {
     "Samples": "bundle.samples",
     "Scene": "scene.solve",
     "Settings": "settings",
+    "best_burst": "pipeline.choose",
     "calibrate": "bundle.calibrate",
     "diagnose": "pipeline.diagnose",
     "find_doubled": "io",
