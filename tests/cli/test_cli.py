@@ -8,6 +8,7 @@ import sys
 import time
 from functools import partial
 
+import av
 import numpy as np
 import pytest
 import tifffile
@@ -15,7 +16,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from napari_fiberburst.cli import demo, main, reconstruct
-from napari_fiberburst.simulation import Faults, simulate
+from napari_fiberburst.simulation import Faults, simulate, simulate_recording
 
 SMALL = ["--preset", "paper", "--scene-width", "16", "--motion-width", "16", "--batch", "200", "--device", "cpu"]
 
@@ -73,6 +74,53 @@ def test_simulate_takes_a_flat_field_image_as_the_bundle(tmp_path):
         np.testing.assert_allclose(
             arrays["transmission"][bright] / flat[bright], 1 / np.quantile(flat, 0.999), rtol=0.01
         )
+
+
+def test_simulate_writes_a_recording_and_its_truth_beside_it(tmp_path):
+    path = tmp_path / "clip.avi"
+    command = [
+        "simulate",
+        "--recording",
+        "handheld",
+        "-o",
+        str(path),
+        "--shape",
+        "43x51",
+        "--frames",
+        "30",
+        "--seed",
+        "3",
+    ]
+    options = ["--turn", "2", "--gaps", "1", "--jumps", "1", "--cells", "2", "--flicker", "0.05", "--pitch", "5"]
+    assert main([*command, *options]) == 0
+    recording = simulate_recording(
+        shape=(43, 51), frames=30, path="handheld", seed=3, turn=2.0, gaps=1, jumps=1, cells=2, flicker=0.05, pitch=5.0
+    )
+    with av.open(path) as video:
+        frames = np.stack([frame.to_ndarray(format="gray") for frame in video.decode(video=0)])
+    np.testing.assert_array_equal(frames, recording.source.recorded(range(30))[..., 0])
+    with np.load(tmp_path / "clip.truth.npz") as truth:
+        assert {"homographies", "in_contact", "cuts", "cells", "traces"} <= set(truth)
+        for name, array in recording.arrays().items():
+            np.testing.assert_array_equal(truth[name], array)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--recording", "raster", "-o", "a.burst"], "a recording is written to a file ending in .avi, .mkv, .mp4"),
+        (["--recording", "raster", "-o", "a.avi", "--smear", "0.5"], "smear is a fault of bursts; recordings have"),
+        (["--recording", "raster", "-o", "a.avi", "--motion", "raster"], "leave --motion out"),
+        (["--recording", "raster", "-o", "a.avi", "--scene", "cat"], "take fewer frames, smaller steps"),
+        (["-o", "a.burst", "--laps", "2"], "--laps is of recordings; say by --recording where the probe goes"),
+        (["-o", "a.burst", "--scene", "slide"], "unknown scene 'slide'"),
+    ],
+)
+def test_simulate_tells_bursts_from_recordings(tmp_path, monkeypatch, capsys, options, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_simulate_refuses_faults_that_cannot_be(tmp_path, capsys):

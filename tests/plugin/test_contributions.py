@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -32,7 +33,9 @@ FAULTY = {
 
 def test_every_scene_is_a_sample_in_both_physics_and_some_have_faults():
     keys = {sample.key for sample in MANIFEST.contributions.sample_data}
-    assert keys == {f"{scene}_{physics}" for scene in SCENES for physics in ("mask", "core")} | set(FAULTY)
+    assert keys == {f"{scene}_{physics}" for scene in SCENES for physics in ("mask", "core")} | set(FAULTY) | {
+        "recording_slide"
+    }
 
 
 def test_opening_a_menu_loads_no_torch():
@@ -66,6 +69,24 @@ def test_a_faulty_sample_is_told_from_others_by_its_name_its_recipe_and_its_trut
     scene, physics = metadata["recipe"]["scene"], metadata["recipe"]["physics"]
     again = simulate(scene, physics=physics, faults=Faults(**faults))
     np.testing.assert_array_equal(again.arrays()["frames"], frames)
+
+
+def test_the_sample_of_a_recording_makes_a_frame_when_it_is_shown(make_napari_viewer):
+    tracemalloc.start()
+    ((frames, look, _),) = contributions.recording_slide()
+    viewer = make_napari_viewer()
+    layer = viewer.add_image(frames, **look)
+    assert frames.shape == (2000, 256, 256)
+    viewer.dims.set_current_step(0, 1234)
+    shown = np.asarray(layer._slice.image.raw)
+    held = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert held < frames.nbytes / 4
+    np.testing.assert_array_equal(shown, frames[1234].compute())
+    assert not np.array_equal(shown, frames[1233].compute())
+    metadata = look["metadata"]["fiberburst"]
+    assert metadata["homographies"].shape == (2000, 3, 3)
+    assert 0 < (~metadata["in_contact"]).sum() < 50
 
 
 @pytest.mark.parametrize("ending", [".burst", ".npz"])

@@ -6,6 +6,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from napari_fiberburst.io import open_recording
+
 
 def add_to(commands: Any) -> None:
     """Add the command to the parser."""
@@ -36,7 +38,9 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Make the mosaic and say what has come of it."""
-    from napari_fiberburst.recordings.mosaic import check_mosaic, mosaicking  # torch takes seconds to load
+    # torch takes seconds to load
+    from napari_fiberburst.pipeline.reconstruct import as_bundle
+    from napari_fiberburst.recordings.mosaic import check_mosaic, mosaicking
 
     check_mosaic(options.output)
     source = open_recording(options.input[0] if len(options.input) == 1 else options.input)

@@ -6,7 +6,7 @@ Imported when napari starts to use one of them; loads neither torch nor, before 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import tifffile
@@ -22,6 +22,16 @@ LayerData = tuple[Any, dict[str, Any], str]
 PLUGIN = "napari-fiberburst"
 # As many frames and pixels as a sample can have that opens at once.
 _SAMPLE_SHAPE, _SAMPLE_FRAMES = (256, 256), 20
+# A recording by hand, as they are: it turns, comes nearer and loses contact.
+_RECORDING_FRAMES: Final = 2000
+_RECORDING_SETTINGS: Final[dict[str, Any]] = {
+    "path": "handheld",
+    "turn": 3.0,
+    "zoom": 0.02,
+    "gaps": 2,
+    "flicker": 0.02,
+    "drift": 0.1,
+}
 # What a file of a simulated burst holds of the recording; all else is truth.
 _RECORDING = {"frames", "axes", "black_level", "white_level"}
 # RGBA of a bundle's cores by their state, as `Bundle.image` has them, and the quantile of light that is shown white.
@@ -53,6 +63,29 @@ def make_sample(scene: str, physics: str, **faults: Any) -> list[LayerData]:
         "metadata": {METADATA_KEY: {"recipe": {"scene": scene, "physics": physics, **faults}, **_truth_in(arrays)}},
     }
     return [(frames[..., 0] if is_grey else frames, look, "image")]
+
+
+def recording_slide() -> list[LayerData]:
+    """Return a long simulated recording as an image layer, each frame made when it is shown; truth as `make_sample`."""
+    from napari_fiberburst.plugin.stacks import as_read
+    from napari_fiberburst.simulation import simulate_recording
+
+    recording = simulate_recording("slide", frames=_RECORDING_FRAMES, **_RECORDING_SETTINGS)
+    known, times = recording.source.acquisition, recording.source.acquisition.times
+    look = {
+        "name": f"recording, {_RECORDING_FRAMES:,} frames",
+        "rgb": False,
+        "axis_labels": ("t", "y", "x"),
+        "contrast_limits": (known.black_level, known.white_level),
+        "metadata": {
+            METADATA_KEY: {
+                "recipe": {"scene": "slide", "frames": _RECORDING_FRAMES, **_RECORDING_SETTINGS},
+                RECORDING_KEY: {"channel_names": (), "times": () if times is None else times.tolist()},
+                **recording.arrays(),
+            }
+        },
+    }
+    return [(as_read(recording.source), look, "image")]
 
 
 # napari calls a sample by a name of its own, without arguments.

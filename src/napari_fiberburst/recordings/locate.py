@@ -1,7 +1,7 @@
 """Where every frame of a recording lies: calibrate the bundle, trace its cores, register the frames, refine them."""
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from napari_fiberburst.bundle.mount import find_mount
 from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import in_grey, only_exposed
 from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.recordings.poses import Poses
 from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
 from napari_fiberburst.recordings.register import registering
@@ -22,12 +23,15 @@ from napari_fiberburst.recordings.traces import Traces, tracing
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.views import middle_of
 from napari_fiberburst.recordings.work import Doing, Work, complete
+from napari_fiberburst.scene.shading import find_shading
 from napari_fiberburst.steps import drain
 
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
 # Scene and frames are found in turn so many times.
 _ROUNDS = 3
+# The slow changes of the illumination are told by so many frames, spread over the recording.
+_SHADED_FROM = 60
 # Where the frames have seen so many times their own field, the mean of what a core has seen is its gain; on a shorter
 # path the object is in it.
 _WIDE = 2.0
@@ -87,6 +91,8 @@ def locating(
         for _, left in complete(refine_unit, stage, work, units, client):
             yield Doing("refining", number, _ROUNDS, left, len(units))
         track = refined(track, [Refinement.load(work.path(stage, unit)) for unit in units])
+        if number == 0 and track.pieces and not work.bundle.gains_known:
+            track = _evened(traces, track)
     return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
 
 
@@ -128,10 +134,28 @@ def _first_track(work: Work, traces: Traces, poses: Poses) -> Track:
     if work.bundle.gains_known or (x1 - x0) * (y1 - y0) < _WIDE * shape[0] * shape[1]:
         return track
     mean = traces.summary.mean_light.numpy()
-    usual = float(np.median(mean[mean > 0]))
-    gains = np.where(mean > 0, mean / usual, 1).astype(np.float32)
-    track.gains[:] = gains[:, None]
-    return track
+    gains = np.where(mean > 0, mean / np.median(mean[mean > 0]), 1).astype(np.float32)
+    return replace(track, gains=np.repeat(gains[:, None], channels, axis=1))
+
+
+def _evened(traces: Traces, track: Track) -> Track:
+    """Return the track with the slow changes of the illumination in its gains.
+
+    Scene and gains follow one another where those change slowly over the frame, so that finding them in turn takes many
+    rounds. Some frames of the largest piece tell them at once.
+    """
+    frames = track.frames_of(0)
+    frames = frames[:: max(1, len(frames) // _SHADED_FROM)]
+    samples = traces.samples(frames).without_gains(torch.from_numpy(track.gains))
+    registration = Registration.known(track.scene_from_frame[frames], track.shape, samples.cores)
+    shading = find_shading(samples, replace(registration, exposures=track.exposures[frames]))
+    if shading is None:
+        return track
+    gains = track.gains * shading.gains.numpy()
+    # The frames between those that were asked have the exposures of these.
+    change = np.interp(np.arange(len(track)), frames, shading.exposures.numpy()).astype(np.float32)
+    exposures = np.where(track.piece == 0, track.exposures * change, track.exposures)
+    return replace(track, gains=gains, exposures=exposures)
 
 
 def _remarks(traces: Traces, track: Track) -> tuple[str, ...]:

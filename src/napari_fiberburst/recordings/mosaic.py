@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
-from skimage.draw import polygon
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
@@ -248,8 +248,10 @@ def _frames_behind(track: Track, frames: NDArray[np.int64], grid: Grid, bundle: 
     outline = bundle.centres[ConvexHull(bundle.centres).vertices]
     count = np.zeros(grid.shape, np.float32)
     for matrix in track.scene_from_frame[frames]:
-        x, y = (transform_points(matrix, outline) - (grid.x0, grid.y0)).T / grid.spacing
-        count[polygon(y, x, count.shape)] += 1  # type: ignore[no-untyped-call]
+        places = (transform_points(matrix, outline) - (grid.x0, grid.y0)) / grid.spacing
+        looked = Image.new("1", grid.shape[::-1])
+        ImageDraw.Draw(looked).polygon([(x, y) for x, y in places.tolist()], fill=1)
+        count += np.asarray(looked)
     return torch.from_numpy(count)
 
 

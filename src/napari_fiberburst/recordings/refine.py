@@ -34,6 +34,8 @@ _EXPOSURE_PRIOR = 1.0
 _MOST_SHIFT, _MOST_EXPOSURE, _MOST_TURN = 2.0, 0.5, 0.02
 # Gains of cores that have seen less than this part of the usual light are left, and no gain changes by more than this.
 _LEAST_LIGHT, _MOST_GAIN = 0.05, 5.0
+# Frames turn and grow where that explains their samples better than noise would, by this ratio in the median.
+_TURNING = 8.0
 # Frames that are less like the scene than this do not belong to it.
 _LEAST_ALIKE = 0.3
 
@@ -54,6 +56,8 @@ class Refinement(Stored):
         (n,) root mean square of what the scene misses of each frame's samples, full scale 1.
     alike : numpy.ndarray
         (n,) correlation of what each frame shows with what the scene does.
+    turning : numpy.ndarray
+        (n,) by how much turning and growing each frame would explain it better, as a ratio to what noise explains.
     agreement, power : Tensor
         (N, C), sums over the frames of what each core shows times what the scene shows, and of the latter's square.
     """
@@ -65,6 +69,7 @@ class Refinement(Stored):
     exposures: NDArray[np.float32]
     missed: NDArray[np.float64]
     alike: NDArray[np.float64]
+    turning: NDArray[np.float64]
     agreement: Tensor
     power: Tensor
 
@@ -97,6 +102,7 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
                 ("exposures", "exposures"),
                 ("missed", "alike"),
                 ("alike", "alike"),
+                ("turning", "alike"),
             )
         },
         agreement=sum((part.agreement for part in found), none),
@@ -113,7 +119,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     residual = samples.grey - light
     typical = (_sums(weights, residual.square()) / weights.sum(dim=1).clamp_min(1e-9)).sqrt().clamp_min(1e-6)
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
-    exposures, matrices = _stepped(track, frames, points, robust, residual, light, (along_x, along_y))
+    exposures, matrices, turning = _stepped(track, frames, points, robust, residual, light, (along_x, along_y))
     agreement, power = _light(samples, sampling, robust, filtered)
     return Refinement(
         frames=frames,
@@ -121,6 +127,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
         exposures=exposures,
         missed=typical.double().numpy(),
         alike=_correlation(samples.grey, light, weights).double().numpy(),
+        turning=turning / typical.double().numpy() ** 2,
         agreement=agreement,
         power=power,
     )
@@ -140,21 +147,26 @@ def _stepped(
     residual: Tensor,
     light: Tensor,
     slopes: tuple[Tensor, Tensor],
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return exposures and places of frames after one step of Gauss-Newton each."""
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    """Return exposures and places of frames after one step of Gauss-Newton each.
+
+    And by how much of the residuals' square a turn and a growth would lower it, half of that for each.
+    """
     along_x, along_y = slopes
     half = max(track.shape) / 2
     middle = (points * weights[..., None]).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-9)[:, None]
     x, y = ((points - middle[:, None]) / half).unbind(dim=-1)
-    rows = [light, along_x, along_y]
-    if track.dof > 2:
-        rows += [half * (x * along_x + y * along_y), half * (x * along_y - y * along_x)]
-    jacobian = torch.stack(rows, dim=1)
+    turns = [half * (x * along_x + y * along_y), half * (x * along_y - y * along_x)]
+    jacobian = torch.stack([light, along_x, along_y, *turns], dim=1)
     weighted = jacobian * weights[:, None]
     normal = weighted @ jacobian.mT
     normal = normal + torch.diag_embed(1e-4 * normal.diagonal(dim1=1, dim2=2) + 1e-9)
     normal[:, 0, 0] += _EXPOSURE_PRIOR
-    step = torch.linalg.solve(normal, (weighted @ residual[..., None]))[..., 0].double().numpy()
+    rhs = (weighted @ residual[..., None])[..., 0]
+    whole = torch.linalg.solve(normal, rhs)
+    shifted = torch.linalg.solve(normal[:, :3, :3], rhs[:, :3])
+    turning = ((whole * rhs).sum(dim=1) - (shifted * rhs[:, :3]).sum(dim=1)) / 2
+    step = (shifted if track.dof == 2 else whole).double().numpy()
     exposures = track.exposures[frames] * (1 + step[:, 0].clip(-_MOST_EXPOSURE, _MOST_EXPOSURE)).astype(np.float32)
     grown, turned = step[:, 3:].clip(-_MOST_TURN, _MOST_TURN).T if track.dof > 2 else np.zeros((2, len(frames)))
     change = np.zeros((len(frames), 3, 3))
@@ -163,7 +175,7 @@ def _stepped(
     centre = middle.double().numpy()
     shift = step[:, 1:3].clip(-_MOST_SHIFT, _MOST_SHIFT)
     change[:, :2, 2] = shift + centre - np.einsum("nij,nj->ni", change[:, :2, :2], centre)
-    return exposures, change @ track.scene_from_frame[frames]
+    return exposures, change @ track.scene_from_frame[frames], turning.double().numpy()
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:
@@ -190,6 +202,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     ratio = torch.where(known, agreement / power.clamp_min(1e-12), torch.ones_like(power))
     gains = track.gains * ratio.clamp(1 / _MOST_GAIN, _MOST_GAIN).numpy()
     usual = float(np.nanmedian(missed))
+    turning = float(np.median(np.concatenate([part.turning for part in parts])))
     return replace(
         track,
         scene_from_frame=matrices,
@@ -199,6 +212,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
         weights=np.nan_to_num((usual / np.maximum(missed, usual)) ** 2).astype(np.float32),
         alike=alike,
         error=usual,
+        dof=4 if turning > _TURNING else track.dof,
     )
 
 

@@ -22,7 +22,7 @@ _GAPS = (1, 2, 4)
 _LOOP_ROUNDS = 2
 # In parts of the field's shorter side: frames whose middles are this near see the same place; and how wrong the chain
 # of neighbours may have them.
-_NEAR, _DRIFT = 0.5, 0.25
+_NEAR, _DRIFT = 0.75, 0.25
 # Frames so many places apart belong to other passes of the path; each frame is tied to so many passes at most.
 _PASS, _MOST_PASSES = 8, 10
 # Pairs to a unit of work.

@@ -47,6 +47,8 @@ RECORDED_PHYSICS = ("core", "mask", "filtered")
 _SHAPE, _FRAMES, _PITCH = (256, 256), 400, 4.7
 # The default step, in parts of the frame's shorter side.
 _STEP = 0.035
+# The default distance of a cut, in parts of the frame's longer side: nothing is seen in both frames.
+_JUMP = 1.2
 # How far a lifted probe's picture is blurred where no light comes back any more, pitches.
 _BLUR = 4.0
 # The filter that takes the cores out of a frame, in pitches, and the least light of the bundle that it divides by.
@@ -357,87 +359,87 @@ def simulate_recording(
     count = frames if frames is not None else (_FRAMES if isinstance(path, str) else len(np.asarray(path)))
     check_numbers(size, count, channels, seed)
     check_bundle(bundle, is_measured=flat is not None)
-    _check_amounts(
-        step=step, laps=laps, turn=turn, zoom=zoom, gaps=gaps, gap_frames=gap_frames, jumps=jumps, jump=jump,
-        bending=bending, drift=drift, cells=cells, flash=flash, flash_frames=flash_frames, rate=rate,
-    )  # fmt: skip
-    camera = camera or Camera()
-    faults = Faults(flicker=flicker, field=field, overlay=overlay, vignette=vignette)
-    # The first five as in `simulate`, so that the same seed lays out the same bundle.
+    _check_counts(laps=laps, gaps=gaps, gap_frames=gap_frames, jumps=jumps, cells=cells, flash_frames=flash_frames)
+    _check_amounts(step=step, turn=turn, zoom=zoom, jump=jump, bending=bending, drift=drift, flash=flash, rate=rate)
+    # The first four as in `simulate`, so that the same seed lays out the same bundle.
     scene_rng, path_rng, bundle_rng, camera_rng, event_rng = np.random.default_rng(seed).spawn(5)
     jump_rng, contact_rng, light_rng, bend_rng, cell_rng = event_rng.spawn(5)
     cuts = draw_cuts(count, jumps, jump_rng)
-    homographies = cut(
-        _path(path, count, size, path_rng, step=step, laps=laps, turn=turn, zoom=zoom),
-        cuts,
-        1.2 * max(size) if jump is None else jump,
-        jump_rng,
-    )
+    smooth = _path(path, count, size, path_rng, step=step, laps=laps, turn=turn, zoom=zoom)
+    homographies = cut(smooth, cuts, _JUMP * max(size) if jump is None else jump, jump_rng)
     bent = draw_bending(count, bending, size, bend_rng)
     bounds = _bounds(homographies, size, 0.0 if bent is None else bent.most)
-    world = _world(scene, size, channels, bounds, scene_rng)
-    if flat is None:
-        relay = designed(make_bundle(size, bundle_rng, **{"pitch": _PITCH, **bundle}), size, None)(np.zeros(2))
-    else:
-        relay = measured(prepared_flat(flat, size, channels), None, **bundle)(np.zeros(2))
-    optics = make_optics(faults, size, channels, is_circle=bundle.get("outline") == "circle")
-    blinking = draw_cells(
-        cells, homographies, size, cell_rng, radius=_CELL_RADIUS * relay.bundle.pitch, flash=flash, length=flash_frames
-    )
-    views = _Views(world=world, homographies=homographies, bending=bent, cells=blinking)
+    relay = _relay(flat, size, channels, bundle_rng, bundle)
+    radius = _CELL_RADIUS * relay.bundle.pitch
     simulator = _Simulator(
-        views=views,
+        views=_Views(
+            world=_world(scene, size, channels, bounds, scene_rng),
+            homographies=homographies,
+            bending=bent,
+            cells=draw_cells(cells, homographies, size, cell_rng, radius=radius, flash=flash, length=flash_frames),
+        ),
         relay=relay,
-        optics=optics,
+        optics=make_optics(
+            Faults(flicker=flicker, field=field, overlay=overlay, vignette=vignette),
+            size,
+            channels,
+            is_circle=bundle.get("outline") == "circle",
+        ),
         physics=physics,
-        camera=camera,
+        camera=camera or Camera(),
         exposures=draw_exposures(count, flicker, drift, light_rng),
         lifts=draw_lifts(count, gaps, gap_frames, contact_rng),
         channels=channels,
         seed=int(camera_rng.integers(2**63)),
     )
-    return _recording(simulator, cuts, bounds, rate, scene if isinstance(scene, str) else type(scene).__name__, path)
+    what = scene if isinstance(scene, str) else type(scene).__name__
+    name = f"simulated {what}, {path if isinstance(path, str) else 'path given'}"
+    return _recording(simulator, name, cuts, bounds, rate)
+
+
+def _relay(
+    flat: ArrayLike | None, shape: tuple[int, int], channels: int, rng: np.random.Generator, bundle: dict[str, Any]
+) -> Relay:
+    """Return what becomes of light in a bundle that is laid out, or was measured."""
+    if flat is None:
+        relay_at = designed(make_bundle(shape, rng, **{"pitch": _PITCH, **bundle}), shape, None)
+    else:
+        relay_at = measured(prepared_flat(flat, shape, channels), None, **bundle)
+    return relay_at(np.zeros(2))
 
 
 def _recording(
     simulator: _Simulator,
+    name: str,
     cuts: NDArray[np.intp],
     bounds: tuple[float, float, float, float],
     rate: float,
-    scene: str,
-    path: str | ArrayLike,
 ) -> SimulatedRecording:
     """Return a recording of what a simulator makes."""
     views, relay, optics = simulator.views, simulator.relay, simulator.optics
-    count, channels = len(views.homographies), simulator.channels
-    first = simulator([0])
+    count = len(views.homographies)
+    some = simulator([0, count // 2, count - 1])
     acquisition = Acquisition(
-        shape=(count, *first.shape[1:3], channels),
-        axes="TYX" if channels == 1 else "TYXC",
-        dtype=first.dtype,
+        shape=(count, *some.shape[1:3], simulator.channels),
+        axes="TYX" if simulator.channels == 1 else "TYXC",
+        dtype=some.dtype,
         black_level=0.0,
         white_level=float(simulator.camera.full_scale),
         times=np.arange(count) / rate,
     )
-    seen = np.ones_like(relay.flat) if simulator.physics == "filtered" else relay.flat
-    if simulator.physics == "filtered":
-        seen = seen * optics.field[..., None]
-    cells = views.cells
+    fingerprint = _fingerprint(simulator, some, rate)
+    is_filtered = simulator.physics == "filtered"
+    flat = np.where(optics.field[..., None], 1.0, 0.0) if is_filtered else relay.flat
     return SimulatedRecording(
-        source=FrameSource(
-            acquisition=acquisition,
-            reader=simulator,
-            name=f"simulated {scene}, {path if isinstance(path, str) else 'path given'}",
-            fingerprint=_fingerprint(simulator, first, rate),
-        ),
+        source=FrameSource(acquisition=acquisition, reader=simulator, name=name, fingerprint=fingerprint),
         homographies=views.homographies,
         in_contact=simulator.lifts == 0,
         cuts=cuts,
         exposures=simulator.exposures,
-        cells=np.zeros((0, 2)) if cells is None else cells.places,
-        traces=np.zeros((count, 0), np.float32) if cells is None else cells.traces,
+        cells=np.zeros((0, 2)) if views.cells is None else views.cells.places,
+        traces=np.zeros((count, 0), np.float32) if views.cells is None else views.cells.traces,
         cell_radius=_CELL_RADIUS * relay.bundle.pitch,
-        transmission=(seen if optics.shading is None else seen * optics.shading).mean(axis=2),
+        transmission=(flat if optics.shading is None else flat * optics.shading).mean(axis=2),
         bundle=relay.bundle,
         world=views.world,
         bounds=bounds,
@@ -512,19 +514,25 @@ def _world(
     return scene
 
 
+def _check_counts(**counts: int) -> None:
+    for name, value in counts.items():
+        least = 0 if name in ("gaps", "jumps", "cells") else 1
+        if not isinstance(value, int | np.integer) or value < least:
+            raise SettingsError(f"{name} must be an integer of at least {least}; got {value!r}")
+
+
 def _check_amounts(**amounts: float | None) -> None:
     for name, value in amounts.items():
-        least = {"laps": 1, "gap_frames": 1, "flash_frames": 1}.get(name, 0)
-        if value is not None and (isinstance(value, str) or not least <= value < math.inf):
-            raise SettingsError(f"{name} must be a number of at least {least}; got {value!r}")
+        if value is not None and (isinstance(value, str) or not 0 <= value < math.inf):
+            raise SettingsError(f"{name} must be a number of at least 0; got {value!r}")
     if amounts["rate"] == 0:
-        raise SettingsError("rate must be above 0 frames a second; got 0")
+        raise SettingsError("rate must be above 0 frames per second; got 0")
 
 
-def _fingerprint(simulator: _Simulator, first: NDArray[np.generic], rate: float) -> str:
-    """Return what differs where any frame does: hashed are all numbers that frames are made of, and frame 0."""
+def _fingerprint(simulator: _Simulator, some: NDArray[np.generic], rate: float) -> str:
+    """Return what differs where any frame does: of all numbers that frames are made of, and of some frames."""
     views = simulator.views
-    parts = [first, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
+    parts = [some, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
     parts += [] if views.cells is None else [views.cells.places, views.cells.traces]
     parts += [] if views.bending is None else [views.bending.waves, views.bending.courses]
     digest = sha256(repr((simulator.camera, simulator.physics, simulator.seed, rate)).encode())
@@ -538,5 +546,5 @@ def _pixels(shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the pixels of a frame, (H, W, 2) as (x, y)."""
     rows, columns = np.indices(shape, dtype=np.float64)
     pixels = np.stack([columns, rows], axis=-1)
-    pixels.flags.writeable = False  # it is shared
+    pixels.setflags(write=False)  # it is shared
     return pixels

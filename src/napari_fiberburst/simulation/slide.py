@@ -106,7 +106,7 @@ def _tile(slide: Slide, column: int, row: int) -> NDArray[np.float32]:
     chromatin = np.exp(0.5 * ground.noise(30, 2, 2))
     haematoxylin = 0.06 * (1 - lumen) + _nuclei(ground, wall, stroma) * chromatin
     density = haematoxylin[None] * _HAEMATOXYLIN[:, None, None] + eosin[None] * _EOSIN[:, None, None]
-    light = (_CLEAR * np.exp(-density)).astype(np.float32)[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    light = (_CLEAR * np.exp(-density))[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
     positions = np.linspace(0, 2, slide.channels)
     mixing = np.array([np.interp(positions, range(3), band) for band in np.eye(3)], np.float32)
     if slide.channels == 1:
@@ -115,39 +115,39 @@ def _tile(slide: Slide, column: int, row: int) -> NDArray[np.float32]:
     return mixed
 
 
-def _fibres(ground: "_Ground") -> NDArray[np.float64]:
+def _fibres(ground: "_Ground") -> NDArray[np.float32]:
     """Return fine curved lines (H, W), about 1 on a line: level lines of noise that is longer than it is thick."""
     thick, long = _FIBRE
     bent = 1.5 * ground.noise(5, long, long)
     flat, steep = ground.noise(3, long, thick) + bent, ground.noise(4, thick, long) + bent
     is_flat = _step(ground.noise(6, 3 * long, 3 * long) / 0.3)
-    lines: NDArray[np.float64] = is_flat * np.exp(-((flat / 0.2) ** 2)) + (1 - is_flat) * np.exp(-((steep / 0.2) ** 2))
+    lines: NDArray[np.float32] = is_flat * np.exp(-((flat / 0.2) ** 2)) + (1 - is_flat) * np.exp(-((steep / 0.2) ** 2))
     return lines
 
 
-def _nuclei(ground: "_Ground", wall: NDArray[np.float64], stroma: NDArray[np.float64]) -> NDArray[np.float64]:
+def _nuclei(ground: "_Ground", wall: NDArray[np.float32], stroma: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return how dark nuclei are stained (H, W): dense in a gland's wall, sparse between glands, none in a lumen."""
     size = ground.size
     columns, rows = ground.lattice(_NUCLEUS_ROOM, _NUCLEUS_ROOM)
-    chance = [_uniform(ground.seed, 40 + number, columns, rows) for number in range(7)]
-    x = (columns + chance[0]) * _NUCLEUS_ROOM - ground.left
-    y = (rows + chance[1]) * _NUCLEUS_ROOM - ground.top
+    chance = [_uniform(ground.seed, 40 + number, columns, rows).astype(np.float32) for number in range(7)]
+    x = columns * _NUCLEUS_ROOM - ground.left + _NUCLEUS_ROOM * chance[0]
+    y = rows * _NUCLEUS_ROOM - ground.top + _NUCLEUS_ROOM * chance[1]
     at = np.clip(np.rint(y).astype(int), 0, size - 1), np.clip(np.rint(x).astype(int), 0, size - 1)
     there = chance[2] < 0.9 * wall[at] + 0.25 * stroma[at]
-    x, y = x[there], y[there]
-    radius = (_NUCLEUS_RADII[0] + np.ptp(_NUCLEUS_RADII) * chance[3][there])[:, None, None]
-    stretch = (_NUCLEUS_STRETCH[0] + np.ptp(_NUCLEUS_STRETCH) * chance[4][there])[:, None, None]
+    x, y = x[there].astype(np.float32), y[there].astype(np.float32)
+    radius = (_NUCLEUS_RADII[0] + (_NUCLEUS_RADII[1] - _NUCLEUS_RADII[0]) * chance[3][there])[:, None, None]
+    stretch = (_NUCLEUS_STRETCH[0] + (_NUCLEUS_STRETCH[1] - _NUCLEUS_STRETCH[0]) * chance[4][there])[:, None, None]
     angle = (math.pi * chance[5][there])[:, None, None]
     stain = (0.35 + 0.9 * chance[6][there])[:, None, None]
-    offsets = np.arange(-_MARGIN + 2, _MARGIN - 1)
-    columns = np.rint(x).astype(int)[:, None, None] + offsets[None, None, :]
-    rows = np.rint(y).astype(int)[:, None, None] + offsets[None, :, None]
-    across, down = columns - x[:, None, None], rows - y[:, None, None]
+    offsets = np.arange(-_MARGIN + 2, _MARGIN - 1, dtype=np.int32)
+    columns = np.rint(x).astype(np.int32)[:, None, None] + offsets[None, None, :]
+    rows = np.rint(y).astype(np.int32)[:, None, None] + offsets[None, :, None]
+    across, down = (columns - x[:, None, None]).astype(np.float32), (rows - y[:, None, None]).astype(np.float32)
     along = (np.cos(angle) * across + np.sin(angle) * down) / stretch
     beside = np.cos(angle) * down - np.sin(angle) * across
     depth = stain * np.clip(radius + 0.5 - np.hypot(along, beside), 0, 1)
     inside = (depth > 0) & (columns >= 0) & (columns < size) & (rows >= 0) & (rows < size)
-    stained = np.zeros(size * size)
+    stained = np.zeros(size * size, np.float32)
     np.maximum.at(stained, (rows * size + columns)[inside], depth[inside])
     return stained.reshape(size, size)
 
@@ -168,14 +168,14 @@ class _Ground:
         grid = np.meshgrid(columns, rows)
         return grid[0].ravel(), grid[1].ravel()
 
-    def noise(self, kind: int, across: int, down: int) -> NDArray[np.float64]:
+    def noise(self, kind: int, across: int, down: int) -> NDArray[np.float32]:
         """Return smooth noise (H, W) of these spacings in pixels, and of about standard deviation 1."""
         over_x, over_y = _basis(self.left, self.size, across), _basis(self.top, self.size, down)
         columns, rows = self.lattice(across, down)
-        values = math.sqrt(12) * (_uniform(self.seed, kind, columns, rows) - 0.5)
+        values = (math.sqrt(12) * (_uniform(self.seed, kind, columns, rows) - 0.5)).astype(np.float32)
         # Sparse, because a dense product's last bit may depend on the number of threads.
-        smooth: NDArray[np.float64] = (over_x @ (over_y @ values.reshape(over_y.shape[1], -1)).T).T
-        return smooth / 0.48  # a bicubic B-spline leaves this much of white noise's standard deviation
+        smooth: NDArray[np.float32] = (over_x @ (over_y @ values.reshape(over_y.shape[1], -1)).T).T
+        return smooth / np.float32(0.48)  # a bicubic B-spline leaves this much of white noise's standard deviation
 
 
 @lru_cache(maxsize=256)
@@ -188,7 +188,7 @@ def _basis(first: int, size: int, spacing: int) -> csr_array:
     weights = np.stack([(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1) / 6
     columns = place[:, None] - low + np.arange(-1, 3)
     pixels = np.repeat(np.arange(size), 4)
-    return csr_array((weights.ravel(), (pixels, columns.ravel())), shape=(size, count))
+    return csr_array((weights.ravel().astype(np.float32), (pixels, columns.ravel())), shape=(size, count))
 
 
 def _uniform(seed: int, kind: int, columns: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -202,7 +202,7 @@ def _uniform(seed: int, kind: int, columns: NDArray[np.int64], rows: NDArray[np.
     return (mixed >> np.uint64(11)).astype(np.float64) / 2.0**53
 
 
-def _step(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _step(value: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return a smooth step from 0 to 1."""
-    step: NDArray[np.float64] = 0.5 * (1 + np.tanh(value))
-    return step
+    step: NDArray[np.floating] = 0.5 * (1 + np.tanh(value))
+    return step.astype(np.float32, copy=False)
