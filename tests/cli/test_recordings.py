@@ -89,6 +89,9 @@ def test_frames_of_a_video_calibrate_a_bundle(clip, capsys):
     assert main(["calibrate", "a clip.mkv", "--frames", "0:70:10", "-o", "a.bundle", "--device", "cpu"]) == 0
     expected = Bundle.from_burst(read_burst(clip, frames="0:70:10"), device="cpu")
     np.testing.assert_allclose(Bundle.load("a.bundle").centres, expected.centres)
+    capsys.readouterr()
+    assert main(["calibrate", "a clip.mkv", "--even", "--frames", "0:9", "-o", "b.bundle"]) == 2
+    assert "--frames chooses frames of a burst" in capsys.readouterr().err
 
 
 def test_a_file_that_is_no_video_is_said(tmp_path, capsys):

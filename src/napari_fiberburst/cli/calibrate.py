@@ -65,6 +65,8 @@ def _calibrated(options: argparse.Namespace) -> "Bundle":
             "images of the bundle in even light"
         )
     is_even = options.even or first.suffix.lower() in _IMAGES
+    if is_even and options.frames is not None:
+        raise BundleError("--frames chooses frames of a burst, and images in even light are taken whole; leave it out")
     burst = None if is_even else read_burst(first, axes=options.axes, frames=options.frames)
     if burst is None or burst.shape[0] == 1:
         return Bundle.from_image(options.input, dark=options.dark, device=options.device)

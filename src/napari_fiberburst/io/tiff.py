@@ -79,8 +79,13 @@ def _is_cut_short(file: tifffile.TiffFile) -> bool:
     (following,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
     if following != 0:  # a further page, of which nothing could be read
         return True
-    pages = [page for series in file.series for page in series.pages]
-    return any(page is None or _end_of(page) > page.parent.filehandle.size for page in pages)
+    return any(map(_lacks_pixels, file.series))
+
+
+def _lacks_pixels(series: tifffile.TiffPageSeries) -> bool:
+    if series.dataoffset is not None:  # pages follow one another, so that not each need be looked at
+        return bool(series.dataoffset + series.nbytes > series.keyframe.parent.filehandle.size)
+    return any(page is None or _end_of(page) > page.parent.filehandle.size for page in series.pages)
 
 
 def _end_of(page: Any) -> int:
