@@ -16,12 +16,16 @@ if TYPE_CHECKING:
     from napari_fiberburst.bundle.samples import sample as sample
     from napari_fiberburst.control import Control as Control
     from napari_fiberburst.data.burst import Burst as Burst
+    from napari_fiberburst.data.source import FrameSource as FrameSource
     from napari_fiberburst.errors import FiberBurstError as FiberBurstError
+    from napari_fiberburst.io import find_doubled as find_doubled
+    from napari_fiberburst.io import open_recording as open_recording
     from napari_fiberburst.io import read_burst as read_burst
     from napari_fiberburst.motion.register import refine as refine
     from napari_fiberburst.motion.register import register as register
     from napari_fiberburst.motion.registration import Registration as Registration
     from napari_fiberburst.networks.image import load as load
+    from napari_fiberburst.pipeline.choose import best_burst as best_burst
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
     from napari_fiberburst.pipeline.reconstruct import reconstruct as reconstruct
@@ -45,17 +49,21 @@ _HOMES = {
     "Control": "control",
     "Diagnostics": "results.diagnostics",
     "FiberBurstError": "errors",
+    "FrameSource": "data.source",
     "Progress": "results.progress",
     "Reconstruction": "results.reconstruction",
     "Registration": "motion.registration",
     "Samples": "bundle.samples",
     "Scene": "scene.solve",
     "Settings": "settings",
+    "best_burst": "pipeline.choose",
     "calibrate": "bundle.calibrate",
     "diagnose": "pipeline.diagnose",
+    "find_doubled": "io",
     "flatten": "pipeline.remeasure",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
+    "open_recording": "io",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
     "refine": "motion.register",

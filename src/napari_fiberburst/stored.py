@@ -61,6 +61,11 @@ class Stored:
             stream.write(safetensors.numpy.save(arrays, metadata))
         return target
 
+    def digest(self) -> str:
+        """Return what tells this value from others of its kind: another one where anything in it differs."""
+        arrays: Arrays = {}
+        return _digest(arrays, json.dumps(_flattened(self, "", arrays), allow_nan=True, sort_keys=True))
+
     @classmethod
     def check_output(cls, path: str | Path) -> Path:
         """Refuse a path that no such value can be saved to; before long work rather than after it.

@@ -167,7 +167,7 @@ def test_bad_axes_are_refused(rng):
     for axes, said in (
         ("TYX", "shape"),
         ("TTYX", "shape"),
-        ("CZYX", "axis Z of TCZYX must have length 1, got 3"),
+        ("CZYX", "axis Z of CZYX must have length 1, got 3"),
         ("TZYX", "length 1, got 3"),
     ):
         with pytest.raises(BurstError, match=said):

@@ -327,7 +327,7 @@ def test_a_tiff_cut_anywhere_is_refused_or_whole(tmp_path, frames, kind):
 def test_what_cannot_be_read_is_refused(tmp_path, frames):
     (tmp_path / "text.tif").write_text("hello")
     (tmp_path / "text.npz").write_text("hello")
-    (tmp_path / "burst.avi").write_text("hello")
+    (tmp_path / "burst.doc").write_text("hello")
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "0.png").write_text("hello")
@@ -346,7 +346,7 @@ def test_what_cannot_be_read_is_refused(tmp_path, frames):
         ("no*.png", "holds no frames"),
         ("text.tif", "cannot be read as TIFF"),
         ("text.npz", "cannot be read as npz"),
-        ("burst.avi", "of no kind that can be read"),
+        ("burst.doc", "of no kind that can be read"),
         ("empty", "holds no frames"),
         ("broken", "0.png cannot be read as an image"),
         ("ragged", r"all frames need one size.*1.png has \(16, 23\)"),

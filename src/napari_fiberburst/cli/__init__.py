@@ -1,4 +1,4 @@
-"""The command ``fiberburst``: reconstruct, calibrate, simulate, demo, info."""
+"""The command ``fiberburst``: reconstruct, mosaic, calibrate, simulate, demo, info."""
 
 import argparse
 import logging
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from napari_fiberburst import __version__
-from napari_fiberburst.cli import calibrate, demo, info, reconstruct, simulate
+from napari_fiberburst.cli import calibrate, demo, info, mosaic, reconstruct, simulate
 from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import FiberBurstError
 
@@ -37,10 +37,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="fiberburst",
-        description="Turn a burst of frames through a fibre bundle into one clean image.",
+        description="Turn frames through a fibre bundle into one clean image.",
     )
     parser.add_argument("--version", action="version", version=f"napari-fiberburst {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (reconstruct, calibrate, simulate, demo, info):
+    for command in (reconstruct, mosaic, calibrate, simulate, demo, info):
         command.add_to(commands)
     return parser

@@ -22,6 +22,13 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(options, name) for name in sorted({"preset", "motion", "encoding", *all_keywords()})}
 
 
+def add_frames(parser: argparse.ArgumentParser) -> None:
+    """Add the option that chooses frames of a recording."""
+    parser.add_argument(
+        "--frames", metavar="FIRST:STOP[:STEP]", help="use these frames alone, such as 100:120 or 100:200:5"
+    )
+
+
 def parse_crop(text: str) -> tuple[tuple[int, int], tuple[int, int]]:
     """Read ``y0:y1,x0:x1`` as rows and columns."""
     try:

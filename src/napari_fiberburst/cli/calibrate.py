@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari_fiberburst.cli.arguments import add_frames
 from napari_fiberburst.cli.info import describe
 from napari_fiberburst.errors import BundleError
 from napari_fiberburst.io import read_burst
@@ -36,6 +37,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--dark", type=Path, nargs="+", help="the same without the light of the object: black level, light of the cores"
     )
+    add_frames(parser)
     parser.add_argument("--axes", help="order of a burst's axes, such as CTYX, where the file does not say it")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda, mps")
     parser.set_defaults(run=run)
@@ -63,7 +65,7 @@ def _calibrated(options: argparse.Namespace) -> "Bundle":
             "images of the bundle in even light"
         )
     is_even = options.even or first.suffix.lower() in _IMAGES
-    burst = None if is_even else read_burst(first, axes=options.axes)
+    burst = None if is_even else read_burst(first, axes=options.axes, frames=options.frames)
     if burst is None or burst.shape[0] == 1:
         return Bundle.from_image(options.input, dark=options.dark, device=options.device)
     if options.dark is not None:

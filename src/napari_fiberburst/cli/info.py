@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari_fiberburst.cli.arguments import add_frames
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io import read_burst
 from napari_fiberburst.io.picture import write_png
 from napari_fiberburst.io.results import check_place
 
@@ -17,11 +17,15 @@ def add_to(commands: Any) -> None:
     """Add the command to the parser."""
     parser: argparse.ArgumentParser = commands.add_parser(
         "info",
-        help="say what a burst or a bundle holds",
-        description="Open a burst, or a bundle that was kept, and say what is known of it.",
+        help="say what a burst, a recording or a bundle holds",
+        description="Open a burst, a recording of any length, or a bundle that was kept, and say what is known of it. "
+        "Of a long recording, offer a burst that suits.",
     )
-    parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, OME-Zarr; or probe.bundle")
+    parser.add_argument(
+        "input", type=Path, help="TIFF, video, folder or pattern of frames, npz, OME-Zarr; or probe.bundle"
+    )
     parser.add_argument("-o", "--output", type=Path, help="draw the bundle as an image into this file, a .png")
+    add_frames(parser)
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.set_defaults(run=run)
 
@@ -37,28 +41,10 @@ def run(options: argparse.Namespace) -> int:
         check_place(options.output)
     if is_bundle:
         return _of_bundle(options.input, options.output)
-    from napari_fiberburst.pipeline.glance import glance  # torch takes seconds to load
+    from napari_fiberburst.cli.recording import facts  # torch takes seconds to load
 
-    burst = read_burst(options.input, axes=options.axes)
-    seen = glance(burst)
-    count, height, width, channels = burst.shape
-    size = "unknown"
-    if burst.pixel_size is not None:
-        size = " x ".join(f"{side:g}" for side in burst.pixel_size) + f" {burst.unit or '(unit unknown)'}"
-    times = "unknown" if burst.times is None else f"{burst.times[0]:g} to {burst.times[-1]:g} s"
-    for name, value in (
-        ("frames", count),
-        ("height x width", f"{height} x {width}"),
-        ("channels", f"{channels} {', '.join(burst.channel_names)}".strip()),
-        ("pixels", f"{burst.dtype}, {burst.nbytes / 2**20:.1f} MiB; {burst.frames.nbytes / 2**20:.1f} MiB in memory"),
-        ("levels", f"black {burst.black_level:g}, white {burst.white_level:g}"),
-        ("brightest", f"{burst.frames.max() * (burst.white_level - burst.black_level) + burst.black_level:g}"),
-        ("pixel size", size),
-        ("times", times),
-        ("shows", seen.words),
-        *(("note", warning) for warning in seen.warnings),
-    ):
-        print(f"{name:15} {value}")
+    for name, value in facts(options.input, options.axes, options.frames):
+        print(f"{name:15} {value}", flush=True)
     return 0
 
 

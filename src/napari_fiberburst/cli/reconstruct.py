@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from napari_fiberburst.cli.arguments import add_settings, parse_crop, settings_of
+from napari_fiberburst.cli.arguments import add_frames, add_settings, parse_crop, settings_of
 from napari_fiberburst.control import Control
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.io import read_burst
@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
         help="make an image from a burst",
         description="Make one clean image from a burst. Ctrl-C writes what there is; a second one ends at once.",
     )
-    parser.add_argument("input", type=Path, help="TIFF, folder or pattern of frames, npz, or OME-Zarr")
+    parser.add_argument("input", type=Path, help="TIFF, video, folder or pattern of frames, npz, or OME-Zarr")
     parser.add_argument(
         "-o",
         "--output",
@@ -47,6 +47,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--figure", type=Path, help="figure.svg or figure.png: a captured frame beside the image, fit for a paper"
     )
+    add_frames(parser)
     parser.add_argument("--crop", type=parse_crop, metavar="Y0:Y1,X0:X1", help="use this part of every frame")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
     parser.add_argument("--black-level", type=float, help="intensity that stands for no light")
@@ -83,7 +84,11 @@ def run(options: argparse.Namespace) -> int:
     given = options.bundle if options.bundle is not None else options.calibration
     known = None if given is None else _opened(given)
     burst = read_burst(
-        options.input, axes=options.axes, black_level=options.black_level, white_level=options.white_level
+        options.input,
+        axes=options.axes,
+        black_level=options.black_level,
+        white_level=options.white_level,
+        frames=options.frames,
     )
     if options.crop is not None:
         burst = burst.crop(*options.crop)

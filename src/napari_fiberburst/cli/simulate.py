@@ -11,8 +11,8 @@ import numpy as np
 from napari_fiberburst.cli import simulate_recording
 from napari_fiberburst.cli.arguments import add_parameter, parse_shape
 from napari_fiberburst.errors import OutputError, SettingsError
+from napari_fiberburst.io.archive import SIMULATED_ENDING
 from napari_fiberburst.io.folder import read_image
-from napari_fiberburst.io.read import SIMULATED_ENDING
 from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.settings.parameter import parameters_of
 from napari_fiberburst.simulation import ENDLESS_SCENES, MOTIONS, RECORDED_PHYSICS, SCENES, Faults, simulate

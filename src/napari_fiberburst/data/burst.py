@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napari_fiberburst.data.layout import Layout
 from napari_fiberburst.errors import BurstError
 
 MIN_SIDE = 16
@@ -130,17 +131,19 @@ class Burst(Acquisition):
         unit: str | None = None,
         times: ArrayLike | None = None,
     ) -> None:
-        stack, order = _as_tyxc(frames, axes)
-        values = _to_float(stack)
+        # numpy and dask arrays are sliced as they are
+        stack: Any = frames if hasattr(frames, "__array_function__") else _stack(frames)
+        layout = Layout.of(stack.shape, axes)
+        values = _to_float(stack, layout)
         dtype = np.dtype(stack.dtype)
-        black, white = _levels(dtype, values, black_level, white_level)
+        black, white = choose_levels(dtype, float(values.min()), float(values.max()), black_level, white_level)
         values -= np.float32(black)
         values /= np.float32(white - black)
         np.clip(values, 0, 1, out=values)
         _check_contents(values)
         super().__init__(
             shape=values.shape,
-            axes=order,
+            axes=layout.axes,
             dtype=dtype,
             black_level=black,
             white_level=white,
@@ -168,7 +171,7 @@ class Burst(Acquisition):
             if not all(isinstance(edge, int | np.integer) for edge in (start, stop)) or not 0 <= start < stop <= size:
                 raise BurstError(f"a crop must lie inside the image, {axis} within 0:{size}; got {start}:{stop}")
         part = np.ascontiguousarray(self.frames[:, slice(*rows), slice(*columns)])
-        _check_size(part.shape)
+        check_size(part.shape)
         _check_contents(part)
         cropped = copy(self)
         _set(cropped, "shape", part.shape)
@@ -186,38 +189,6 @@ class Burst(Acquisition):
 _set = object.__setattr__
 
 
-def _as_tyxc(frames: Any, axes: str | None) -> tuple[Any, str]:
-    """Return the frames as a (T, H, W, C) array, still in their own type and lazy where they were, and their axes."""
-    if not hasattr(frames, "__array_function__"):  # numpy and dask arrays are sliced as they are
-        frames = _stack(frames)
-    if axes is None:
-        axes = {2: "YX", 3: "TYX", 4: "TYXC"}.get(frames.ndim, "")
-    if not isinstance(axes, str):
-        raise BurstError(f'axes must be one letter per axis, such as "CTYX"; got {axes!r}')
-    axes = axes.upper().replace("S", "C")
-    if "T" not in axes and {"Y", "X"} <= set(axes) and len(axes) == frames.ndim:
-        frames, axes = frames[None], "T" + axes  # one frame is a burst where its bundle is known
-    if not {"T", "Y", "X"} <= set(axes) or len(set(axes)) != len(axes) or len(axes) != frames.ndim:
-        raise BurstError(
-            "a burst is one stack with axes (time, height, width) or (time, height, width, channel); got shape "
-            f"{tuple(frames.shape)} with axes {axes or 'unknown'}; open the frames as one stack, or name its axes, "
-            'such as axes="CTYX"'
-        )
-    for position in reversed(range(len(axes))):
-        if axes[position] not in "TYXC":
-            if frames.shape[position] != 1:
-                raise BurstError(
-                    f"axis {axes[position]} of {axes} must have length 1, got {frames.shape[position]}; "
-                    "take one position of it, or name it T or C"
-                )
-            frames = frames[(slice(None),) * position + (0,)]
-            axes = axes[:position] + axes[position + 1 :]
-    frames = frames.transpose(tuple(axes.index(axis) for axis in "TYXC" if axis in axes))
-    if "C" not in axes:
-        return frames[..., None], "TYX"
-    return frames, "TYXC"
-
-
 def _stack(frames: Any) -> NDArray[Any]:
     try:
         return np.stack([np.asarray(frame) for frame in frames])
@@ -228,7 +199,14 @@ def _stack(frames: Any) -> NDArray[Any]:
         ) from error
 
 
-def _check_size(shape: tuple[int, ...]) -> None:
+def check_size(shape: tuple[int, ...]) -> None:
+    """Refuse frames (T, H, W, C) that are none or too small.
+
+    Raises
+    ------
+    BurstError
+        They are.
+    """
     if shape[0] < 1:
         raise BurstError("a burst needs at least one frame, got none; check the file or the slice it comes from")
     if min(shape[1:3]) < MIN_SIDE or shape[3] < 1:
@@ -238,16 +216,25 @@ def _check_size(shape: tuple[int, ...]) -> None:
         )
 
 
-def _to_float(frames: Any) -> NDArray[np.float32]:
+def check_dtype(dtype: np.dtype[Any]) -> None:
+    """Refuse pixels that are no intensities.
+
+    Raises
+    ------
+    BurstError
+        They are neither integers nor floats.
+    """
+    if dtype.kind not in "uif":
+        raise BurstError(f"frames must hold integers or floats, got {dtype}; convert them to uint8, uint16 or float32")
+
+
+def _to_float(frames: Any, layout: Layout) -> NDArray[np.float32]:
     """Convert frame by frame, and refuse values that no camera gives."""
-    _check_size(frames.shape)
-    if np.dtype(frames.dtype).kind not in "uif":
-        raise BurstError(
-            f"frames must hold integers or floats, got {frames.dtype}; convert them to uint8, uint16 or float32"
-        )
-    values = np.empty(frames.shape, np.float32)
+    check_size(layout.shape)
+    check_dtype(np.dtype(frames.dtype))
+    values = np.empty(layout.shape, np.float32)
     for index in range(len(values)):
-        values[index] = np.asarray(frames[index])
+        values[index] = layout.take(frames, index, index + 1)[0]
         if not np.isfinite(values[index]).all():
             raise BurstError(
                 f"frames must be finite, but frame {index} holds NaN or infinity; replace those pixels or leave "
@@ -264,10 +251,16 @@ def _check_contents(values: NDArray[np.float32]) -> None:
         )
 
 
-def _levels(
-    dtype: np.dtype[Any], values: NDArray[np.float32], black: float | None, white: float | None
+def choose_levels(
+    dtype: np.dtype[Any], low: float, high: float, black: float | None, white: float | None
 ) -> tuple[float, float]:
-    low, high = float(values.min()), float(values.max())
+    """Return the levels of no light and of full scale of pixels of a type that have values from low to high.
+
+    Raises
+    ------
+    BurstError
+        Those that are asked for are no levels.
+    """
     if dtype.kind == "f":
         low, full = min(low, 0.0), max(high, 1.0)
     else:

@@ -1,6 +1,7 @@
 """Frames that lie in a file each."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.lazy import Parts
 from napari_fiberburst.io.recording import Recording
 from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
 
@@ -24,25 +26,41 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
 
 
 def read_images(paths: list[Path], source: str) -> Recording:
-    """Read one frame from each file, in natural order of their names.
+    """Open files that hold one frame each, in natural order of their names; each is read when it is wanted.
 
     Raises
     ------
     BurstError
-        No files, a file that is no image, or images of different sizes or types.
+        No files, or the first of them is no image.
     """
     if not paths:
         raise BurstError(f"{source} holds no frames; expected files ending in {', '.join(IMAGE_ENDINGS)}")
-    frames: list[NDArray[Any]] = []
-    for path in sorted(paths, key=natural_key):
-        frame = _read_png(path) if path.suffix.lower() == ".png" else _read_page(path)
-        if frames and (frame.shape, frame.dtype) != (frames[0].shape, frames[0].dtype):
+    ordered = tuple(sorted(paths, key=natural_key))
+    first = _read_frame(ordered[0])
+    pixels = Parts(_Images(ordered, first.shape, first.dtype), (len(ordered),), first.shape, first.dtype)
+    return Recording(pixels=pixels, axes="TYX" if first.ndim == 2 else "TYXC")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """Reads images that are frames of one recording."""
+
+    paths: tuple[Path, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def __call__(self, number: int) -> NDArray[Any]:
+        frame = _read_frame(self.paths[number])
+        if (frame.shape, frame.dtype) != (self.shape, self.dtype):
             raise BurstError(
-                f"all frames need one size and type; {path} has {frame.shape} {frame.dtype} where those before have "
-                f"{frames[0].shape} {frames[0].dtype}; crop or convert it, or leave it out"
+                f"all frames need one size and type; {self.paths[number]} has {frame.shape} {frame.dtype} where the "
+                f"first has {self.shape} {self.dtype}; crop or convert it, or leave it out"
             )
-        frames.append(frame)
-    return Recording(pixels=np.stack(frames), axes="TYX" if frames[0].ndim == 2 else "TYXC")
+        return frame
+
+
+def _read_frame(path: Path) -> NDArray[Any]:
+    return _read_png(path) if path.suffix.lower() == ".png" else _read_page(path)
 
 
 def read_image(path: str | Path) -> NDArray[Any]:
@@ -71,14 +89,14 @@ def read_image(path: str | Path) -> NDArray[Any]:
     order = [axes.index(axis) for axis in "TYXC" if axis in axes]
     if len(order) != len(axes) or not {"Y", "X"} <= set(axes):
         raise BurstError(f"{path} must hold an image or a stack of them; got axes {axes}; save it with axes TYXC")
-    return np.transpose(recording.pixels, order)
+    return np.transpose(np.asarray(recording.pixels), order)
 
 
 def _read_page(path: Path) -> NDArray[Any]:
     """Return the one frame of a TIFF file, (H, W) or (H, W, C)."""
     recording = read_tiff(path)
     axes = (recording.axes or "").replace("S", "C")
-    frame = recording.pixels
+    frame = np.asarray(recording.pixels)
     if "T" in axes and frame.shape[axes.index("T")] == 1:
         frame, axes = frame.squeeze(axes.index("T")), axes.replace("T", "")
     if axes not in ("YX", "YXC", "CYX"):

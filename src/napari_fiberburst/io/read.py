@@ -1,28 +1,15 @@
 """Open a burst from whatever it lies in."""
 
-import glob
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.io.folder import IMAGE_ENDINGS, read_images
-from napari_fiberburst.io.recording import Recording
-from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
-from napari_fiberburst.io.zarr import is_zarr, read_zarr
+from napari_fiberburst.io.archive import ARCHIVE_ENDINGS as ARCHIVE_ENDINGS
+from napari_fiberburst.io.frames import chosen_frames
+from napari_fiberburst.io.sources import about, open_unread
 
-_FORMATS = (
-    "a TIFF stack (.tif, .tiff, .ome.tif), a folder of PNG or TIFF frames, a pattern such as 'frames/*.png', "
-    "a simulated burst (.burst), a .npz file, or OME-Zarr (.zarr)"
-)
-# Of a simulated burst with its truth: numpy's archive, under a name that no other reader of napari's claims. Earlier
-# versions wrote .npz, which napari opens by itself, and not as a burst.
-SIMULATED_ENDING = ".burst"
-ARCHIVE_ENDINGS = (SIMULATED_ENDING, ".npz")
-
-_NPZ_SCALARS = ("axes", "black_level", "white_level")
+# A video of more frames is a recording that a burst is to be chosen from.
+_MOST_UNASKED = 200
 
 
 def read_burst(
@@ -31,6 +18,7 @@ def read_burst(
     axes: str | None = None,
     black_level: float | None = None,
     white_level: float | None = None,
+    frames: str | slice | None = None,
 ) -> Burst:
     """Read a burst from a file, a folder or a pattern.
 
@@ -40,11 +28,14 @@ def read_burst(
         A multi-page TIFF or OME-TIFF; a folder of PNG or TIFF frames, or a pattern such as ``frames/*.png``, taken in
         natural order (2 before 10); a ``.burst`` file of a simulated burst, or a ``.npz`` file with only one
         array, or with an array "frames" (and, where they are known, "axes", "black_level" and "white_level"); an
-        OME-Zarr image (needs the extra ``zarr``).
+        OME-Zarr image (needs the extra ``zarr``); a video (needs the extra ``recordings``).
     axes : str, optional
         Order of the axes, where the file does not say it or is wrong.
     black_level, white_level : float, optional
         As in `Burst`.
+    frames : str or slice, optional
+        The frames that are the burst, as Python slices: "100:120", "100:200:5", "-20:". No others are read. All by
+        default, of a video at most 200.
 
     Returns
     -------
@@ -56,52 +47,23 @@ def read_burst(
     BurstError
         There is nothing at the path, it cannot be read, or its frames are no burst.
     """
-    try:
-        recording = _open(Path(path))
+    with about(path):
+        unread = open_unread(path, axes)
+        numbers = chosen_frames(frames, unread.shape[0], unread.name)
+        if frames is None and unread.is_video and len(numbers) > _MOST_UNASKED:
+            raise BurstError(
+                f"{path} has {len(numbers)} frames, which is a recording rather than a burst; choose some 20 of them, "
+                f'such as frames="0:20"; fiberburst info {path} offers some that suit'
+            )
+        pixels = unread.reader(numbers)
+        known = dict(unread.metadata)
+        if "times" in known:
+            known["times"] = known["times"][list(numbers)]
+        black, white = unread.levels
         return Burst(
-            recording.pixels,
-            axes=axes or recording.axes,
-            black_level=recording.black_level if black_level is None else black_level,
-            white_level=recording.white_level if white_level is None else white_level,
-            **recording.usable_metadata(axes),
+            pixels if "C" in unread.axes else pixels[..., 0],
+            axes=unread.axes,
+            black_level=black if black_level is None else black_level,
+            white_level=white if white_level is None else white_level,
+            **known,
         )
-    except BurstError as error:
-        raise error if str(path) in str(error) else BurstError(f"{path}: {error}") from error
-    except OSError as error:
-        raise BurstError(f"{path} cannot be opened ({error}); check its name and its permissions") from error
-
-
-def _open(path: Path) -> Recording:
-    if glob.has_magic(str(path)) and not path.exists():
-        found = [Path(name) for name in glob.glob(str(path))]
-        return read_images(found, str(path))
-    if not path.exists():
-        raise BurstError(f"there is no {path}; expected {_FORMATS}")
-    if path.is_dir():
-        if is_zarr(path):
-            return read_zarr(path)
-        # A dot in front hides a file: those are some system's notes on an image, not images.
-        found = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_ENDINGS and item.name[0] != "."]
-        return read_images([item for item in found if item.is_file()], f"the folder {path}")
-    if path.suffix.lower() in TIFF_ENDINGS:
-        return read_tiff(path)
-    if path.suffix.lower() in ARCHIVE_ENDINGS:
-        return _read_archive(path)
-    raise BurstError(f"{path} is of no kind that can be read; expected {_FORMATS}")
-
-
-def _read_archive(path: Path) -> Recording:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            names = list(arrays)
-            if "frames" not in names and len(names) != 1:
-                raise BurstError(f"{path} needs an array named 'frames'; it has {', '.join(names) or 'none'}")
-            name = "frames" if "frames" in names else names[0]
-            known: dict[str, Any] = {key: arrays[key].item() for key in _NPZ_SCALARS if key in names}
-            if not isinstance(known.get("axes", ""), str):
-                raise BurstError(f'{path} must give its axes as text, such as "CTYX"; got {known["axes"]!r}')
-            return Recording(pixels=arrays[name], **known)
-    except BurstError:
-        raise
-    except Exception as error:  # a damaged archive fails in zipfile, zlib or numpy, each in its own way
-        raise BurstError(f"{path} cannot be read as npz ({error}); save it again with numpy.savez") from error

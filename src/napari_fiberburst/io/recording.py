@@ -27,7 +27,7 @@ class Recording:
     Attributes
     ----------
     pixels : array
-        numpy, or another array that numpy can take slices of.
+        Anything with `shape`, `dtype` and slices that numpy takes; of a file, what reads a slice when it is asked for.
     axes : str or None
         A letter per axis.
     channel_names : tuple of str

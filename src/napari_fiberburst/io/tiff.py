@@ -2,6 +2,8 @@
 
 import logging
 import struct
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.lazy import Handle, Parts
 from napari_fiberburst.io.recording import Recording, with_time
 
 logger = logging.getLogger(__name__)
@@ -19,7 +22,9 @@ _SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 360
 
 
 def read_tiff(path: Path) -> Recording:
-    """Read the frames of a TIFF file: its first series, or all its pages where each is a series of its own.
+    """Open the frames of a TIFF file: its first series, or all its pages where each is a series of its own.
+
+    Pages are read when the pixels are sliced.
 
     Raises
     ------
@@ -29,13 +34,15 @@ def read_tiff(path: Path) -> Recording:
     if path.stat().st_size == 0:
         raise BurstError(f"{path} is empty; copy or export it again")
     try:
-        with tifffile.TiffFile(path) as file:
-            if _is_cut_short(file):
+        handle = Handle(partial(_OpenTiff, path))
+        with handle.use() as tiff:
+            if _is_cut_short(tiff.file):
                 raise BurstError(f"{path} is cut short, or parts of it are missing; copy or export it again")
-            pixels, axes = _light(*_frames(file, path), file.series[0].keyframe)
-            axes = with_time(axes)
+            blank, axes = _light(np.zeros(tiff.part, tiff.dtype), tiff.part_axes, tiff.keyframe)
+            pixels = Parts(_Pages(path, handle), tiff.leading, blank.shape, blank.dtype)
+            axes = with_time(tiff.leading_axes + axes)
             count = pixels.shape[axes.index("T")] if "T" in axes else 1
-            return Recording(pixels=pixels, axes=axes, **_described(file, count))
+            return Recording(pixels=pixels, axes=axes, **_described(tiff.file, count))
     except BurstError:
         raise
     except Exception as error:  # tifffile and its codecs fail on damaged files in many ways
@@ -80,14 +87,69 @@ def _end_of(page: Any) -> int:
     return max((start + length for start, length in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
 
 
-def _frames(file: tifffile.TiffFile, path: Path) -> tuple[NDArray[Any], str]:
-    first, *others = file.series
-    if not others or file.is_ome:  # an OME file may hold further images, of which the first is the one
-        return first.asarray(), first.axes
-    if any((series.shape, series.dtype, series.axes) != (first.shape, first.dtype, first.axes) for series in others):
-        shapes = ", ".join(dict.fromkeys(str(series.shape) for series in file.series))
-        raise BurstError(f"{path} holds pages of different sizes or types, {shapes}; keep the frames of one size")
-    return np.stack([series.asarray() for series in file.series]), "T" + first.axes
+class _OpenTiff:
+    """A TIFF file that is open, and how its frames lie in pages."""
+
+    def __init__(self, path: Path) -> None:
+        self.file = tifffile.TiffFile(path)
+        try:
+            first, *others = self.file.series
+            # An OME file may hold further images, of which the first is the one.
+            self._series = [first] if self.file.is_ome else [first, *others]
+            if any((one.shape, one.dtype, one.axes) != (first.shape, first.dtype, first.axes) for one in self._series):
+                shapes = ", ".join(dict.fromkeys(str(series.shape) for series in self.file.series))
+                raise BurstError(
+                    f"{path} holds pages of different sizes or types, {shapes}; keep the frames of one size"
+                )
+            self.keyframe = first.keyframe
+            self.dtype: np.dtype[Any] = first.dtype
+            split = len(first.shape) - len(self.keyframe.shape)
+            self._pages = int(np.prod(first.shape[:split], dtype=int))
+            self._is_paged = first.shape[split:] == self.keyframe.shape and len(first.pages) == self._pages
+            if not self._is_paged:
+                split, self._pages = 0, 1
+            several = len(self._series) > 1
+            self.leading = (len(self._series),) * several + first.shape[:split]
+            self.leading_axes = "T" * several + first.axes[:split]
+            self.part, self.part_axes = first.shape[split:], first.axes[split:]
+        except BaseException:
+            self.file.close()
+            raise
+
+    def close(self) -> None:
+        self.file.close()
+
+    def read(self, number: int) -> NDArray[Any]:
+        """Return a page, or all there is where frames do not lie in pages."""
+        series, page = self._series[number // self._pages], number % self._pages
+        if not self._is_paged:
+            return np.asarray(series.asarray())
+        if series.dataoffset is None:
+            described = series.pages[page]
+            if described is None:
+                raise ValueError(f"page {page} is missing")
+            return np.asarray(described.asarray())
+        # Without compression, pages follow one another, and some programs describe the first of them alone.
+        size = int(np.prod(self.part, dtype=int))
+        stored = self.dtype.newbyteorder(self.file.byteorder)
+        self.file.filehandle.seek(series.dataoffset + page * size * stored.itemsize)
+        pixels = np.frombuffer(self.file.filehandle.read(size * stored.itemsize), stored)
+        return pixels.astype(self.dtype).reshape(self.part)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pages:
+    """Reads the pages of a TIFF file, as they show light."""
+
+    path: Path
+    handle: Handle[_OpenTiff]
+
+    def __call__(self, number: int) -> NDArray[Any]:
+        try:
+            with self.handle.use() as tiff:
+                return _light(tiff.read(number), tiff.part_axes, tiff.keyframe)[0]
+        except Exception as error:  # as in `read_tiff`
+            raise BurstError(f"{self.path} cannot be read as TIFF ({error}); copy or export it again") from error
 
 
 def _light(pixels: NDArray[Any], axes: str, page: Any) -> tuple[NDArray[Any], str]:

@@ -15,7 +15,7 @@ def is_zarr(path: Path) -> bool:
 
 
 def read_zarr(path: Path) -> Recording:
-    """Read the full-resolution level of an OME-Zarr image.
+    """Open the full-resolution level of an OME-Zarr image; its chunks are read when the pixels are sliced.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def read_zarr(path: Path) -> Recording:
         ome = attributes.get("ome", attributes)
         image = ome["multiscales"][0]
         level = image["datasets"][0]
-        pixels = zarr.open_array(str(path / level["path"]), mode="r")[...]
+        pixels = zarr.open_array(str(path / level["path"]), mode="r")
         return _describe(pixels, image["axes"], level, ome.get("omero", {}))
     except Exception as error:  # zarr, its stores and its codecs each raise their own
         raise BurstError(

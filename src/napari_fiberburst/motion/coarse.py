@@ -7,14 +7,13 @@ overlap. Fine, by `napari_fiberburst.motion.joint`.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
 from torch import Tensor
 
+from napari_fiberburst.motion.correlation import OverlapCorrelation
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur, local_mean
@@ -22,13 +21,11 @@ from napari_fiberburst.operators.grid import Grid
 
 # Images for the coarse search have at most this many pixels a side.
 _MOST_SIDE = 128
-# Pairs need this much of the field in common; less is by chance too often alike.
-_LEAST_OVERLAP = 0.12
 # Up to this many frames every pair is tried; beyond, neighbours in time and every frame with these many landmarks.
 _ALL_PAIRS = 20
 _NEIGHBOURS = 3
 _LANDMARKS = 8
-# Correlations with masks that are kept for other pairs, at most.
+# Of so many frames the spectra are kept, at most.
 _KEPT = 128
 # Brightness and contrast of the images are evened out over so many of their pixels (sigma of a Gaussian), contrast
 # where it is more than this part of the usual one.
@@ -73,9 +70,13 @@ def find_shifts(
         Distance of neighbouring positions, pixels.
     """
     spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
-    images, mask = _images(positions, values, weights, shape, spacing, max(0.5, 0.6 * pitch / spacing))
-    correlation = _Correlation(images, mask)
+    height, width = shape
+    grid = Grid.over((0, 0, width - 1, height - 1), spacing)
+    images, mask = even_images(
+        positions, values, weights, grid, smoothed=max(0.5, 0.6 * pitch / spacing), neighbourhood=_NEIGHBOURHOOD
+    )
     count = len(images)
+    correlation = OverlapCorrelation(lambda number: (images[number], mask[number]), grid.shape, _KEPT)
     scores = np.zeros((count, count))
     pairwise = np.zeros((count, count, 2))
     for first, second in _pairs(count):
@@ -117,31 +118,44 @@ def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> float:
     return max(0.0, float(steady.total(weight * first * second)) / power**0.5) if power > 0 else 0.0
 
 
-def _images(
-    positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], spacing: float, sigma: float
+def even_images(
+    positions: Tensor, values: Tensor, weights: Tensor, grid: Grid, *, smoothed: float, neighbourhood: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the frames as small images (T, h, w), and where there is something to see, (T, h, w)."""
-    height, width = shape
-    at = Grid.over((0, 0, width - 1, height - 1), spacing).at(positions)
-    light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
-    mass = blur(torch.stack([at.adjoint(w) for w in weights]), sigma)
-    mask = mass > 0.2 * steady.mean(mass)
-    return _normalised(torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light)), mask), mask
-
-
-def _normalised(images: Tensor, mask: Tensor) -> Tensor:
-    """Return images (T, h, w) brought to one mean and contrast about every pixel.
+    """Return frames as small images of one brightness and contrast, and where there is something to see.
 
     What is bright, large and unlike the object, such as a reflection, would otherwise decide where a frame lies.
+
+    Parameters
+    ----------
+    positions : Tensor
+        (N, 2) frame pixels.
+    values, weights : Tensor
+        (T, N).
+    grid : Grid
+        Of the images.
+    smoothed, neighbourhood : float
+        Sigmas of Gaussians, nodes: of what smooths the images, and of that over which they are evened out.
+
+    Returns
+    -------
+    images : Tensor
+        (T, h, w).
+    mask : Tensor
+        (T, h, w) bool.
     """
+    at = grid.at(positions)
+    light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), smoothed)
+    mass = blur(torch.stack([at.adjoint(w) for w in weights]), smoothed)
+    mask = mass > 0.2 * steady.mean(mass)
+    images = torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light))
     weight = mask.to(images)
     mean, square = (
-        torch.stack([local_mean(image, _NEIGHBOURHOOD, own) for image, own in zip(part, weight, strict=True)])
+        torch.stack([local_mean(image, neighbourhood, own) for image, own in zip(part, weight, strict=True)])
         for part in (images, images.square())
     )
     contrast = (square - mean.square()).clamp_min(0).sqrt()
     usual = contrast[mask].median() if bool(mask.any()) else contrast.new_tensor(1.0)
-    return (images - mean) * weight / (contrast + _LEAST_CONTRAST * usual).clamp_min(1e-9)
+    return (images - mean) * weight / (contrast + _LEAST_CONTRAST * usual).clamp_min(1e-9), mask
 
 
 def _pairs(count: int) -> Iterator[tuple[int, int]]:
@@ -150,72 +164,6 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
         for second in range(first + 1, count):
             if count <= _ALL_PAIRS or second - first <= _NEIGHBOURS or first in landmarks or second in landmarks:
                 yield first, second
-
-
-class _Correlation:
-    """Correlation coefficients of pairs of masked images, over their overlap, for every shift at once."""
-
-    def __init__(self, images: Tensor, masks: Tensor) -> None:
-        self._shape = tuple(int(next_fast_len(2 * side, real=True)) for side in images.shape[1:])
-        masks = masks.to(images.dtype)
-        mass = masks.sum(dim=(1, 2), keepdim=True).clamp_min(1)
-        centred = (images - (images * masks).sum(dim=(1, 2), keepdim=True) / mass) * masks
-        # Most bursts have one mask for all frames, so what is correlated with it serves many pairs.
-        numbers: dict[bytes, int] = {}
-        self._mask_of = [numbers.setdefault(mask.cpu().numpy().tobytes(), i) for i, mask in enumerate(masks)]
-        self._overlap = lru_cache(maxsize=_KEPT)(self._overlap_of)
-        self._side = lru_cache(maxsize=_KEPT)(self._side_of)
-        self._area = masks.sum(dim=(1, 2))
-        self._power = centred.square().sum(dim=(1, 2))
-        self._spectra = {
-            name: torch.fft.rfft2(part, s=self._shape)
-            for name, part in (("mask", masks), ("value", centred), ("square", centred.square()))
-        }
-
-    def best(self, first: int, second: int) -> tuple[NDArray[np.float64], float]:
-        """Return the shift (x, y) from the second image to the first, in their pixels, and its score."""
-        if not float(torch.minimum(self._area[first], self._area[second])) > 0:
-            return np.zeros(2), 0.0
-        mask, mask_second = self._mask_of[first], self._mask_of[second]
-        sums, scale = self._side(first, mask_second, True)
-        sums_second, scale_second = self._side(second, mask, False)
-        # Shifts that leave too little in common have the scale 0.
-        score = (self._correlate("value", first, "value", second) - sums * sums_second) * scale * scale_second
-        place = int(score.argmax())
-        shift = [place % self._shape[1], place // self._shape[1]]
-        for axis, side in enumerate(self._shape[::-1]):
-            shift[axis] -= side if shift[axis] > side // 2 else 0
-        return -np.array(shift, dtype=np.float64), max(0.0, float(score.reshape(-1)[place]))
-
-    def _overlap_of(self, mask: int, mask_second: int) -> tuple[Tensor, Tensor]:
-        """Return how many pixels two masks have in common at every shift, and as a part of the smaller one."""
-        overlap = self._correlate("mask", mask, "mask", mask_second).clamp_min(1e-3)
-        return overlap, overlap / torch.minimum(self._area[mask], self._area[mask_second])
-
-    def _side_of(self, image: int, other_mask: int, is_first: bool) -> tuple[Tensor, Tensor]:
-        """Return what one image of a pair makes of the correlation: its sums over the overlap, and a scale.
-
-        They depend on the other image's mask alone, so most pairs share them.
-        """
-        own_mask = self._mask_of[image]
-        masks = (own_mask, other_mask) if is_first else (other_mask, own_mask)
-        overlap, share = self._overlap(*masks)
-        sums, squares = (
-            self._correlate(part, image, "mask", other_mask)
-            if is_first
-            else self._correlate("mask", other_mask, part, image)
-            for part in ("value", "square")
-        )
-        # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
-        power = (squares - sums**2 / overlap).clamp_min(0) + 0.02 * share * self._power[image]
-        weight = torch.where(share > _LEAST_OVERLAP, share.clamp(0, 1) ** 0.125, torch.zeros_like(share))
-        return sums / overlap.sqrt(), weight / power.sqrt().clamp_min(1e-6)
-
-    def _correlate(self, part: str, first: int, part_second: str, second: int) -> Tensor:
-        """Return one part of an image correlated with another part of a second image, at every shift."""
-        spectrum = steady.complex_product(self._spectra[part][first].conj(), self._spectra[part_second][second])
-        correlated: Tensor = steady.irfft2(spectrum, self._shape)
-        return correlated
 
 
 def _span(scores: NDArray[np.float64], pairwise: NDArray[np.float64]) -> CoarseShifts:

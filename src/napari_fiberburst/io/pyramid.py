@@ -1,0 +1,107 @@
+"""OME-Zarr 0.5 images that are written a tile at a time and opened at every zoom."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+# Pixels to a side of a chunk, and of the coarsest level at most.
+CHUNK = 256
+
+
+def create_pyramid(
+    path: Path,
+    shape: tuple[int, ...],
+    *,
+    name: str,
+    pixel_size: tuple[float, float] | None = None,
+    unit: str | None = None,
+    channels: tuple[str, ...] = (),
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Make an image of float32 with nothing in it: NaN.
+
+    Parameters
+    ----------
+    path : Path
+        Of the image's group.
+    shape : tuple of int
+        (H, W), or (C, H, W).
+    name : str
+        How the image is called.
+    pixel_size : (float, float), optional
+        Height and width of a pixel.
+    unit : str, optional
+        Of the pixel size, as OME-NGFF names it, such as "micrometer".
+    channels : tuple of str
+        Their names, where they have any.
+    attributes : mapping, optional
+        Of our own, beside what OME-NGFF asks for.
+    """
+    height, width = pixel_size or (1.0, 1.0)
+    lead = (1.0,) * (len(shape) - 2)
+    datasets = []
+    group = zarr.open_group(path, mode="w", zarr_format=3)
+    for level, size in enumerate(_levels(shape)):
+        factor = 2**level
+        group.create_array(
+            str(level),
+            shape=size,
+            chunks=(*(1,) * len(lead), CHUNK, CHUNK),
+            dtype=np.float32,
+            fill_value=np.nan,
+            dimension_names=("c", "y", "x")[-len(shape) :],
+        )
+        # A pixel of a coarser level lies in the middle of those that it stands for.
+        middle = (factor - 1) / 2
+        datasets.append(
+            {
+                "path": str(level),
+                "coordinateTransformations": [
+                    {"type": "scale", "scale": [*lead, factor * height, factor * width]},
+                    {"type": "translation", "translation": [*(0.0 for _ in lead), middle * height, middle * width]},
+                ],
+            }
+        )
+    space = {"type": "space"} | ({} if unit is None or pixel_size is None else {"unit": unit})
+    axes = [{"name": "c", "type": "channel"}] * len(lead) + [{"name": side, **space} for side in "yx"]
+    ome: dict[str, Any] = {"version": "0.5", "multiscales": [{"name": name, "axes": axes, "datasets": datasets}]}
+    group.attrs.update({"ome": ome, **(attributes or {}), **({"channels": list(channels)} if channels else {})})
+
+
+def write_tile(path: Path, rows: tuple[int, int], columns: tuple[int, int], tile: NDArray[np.floating]) -> None:
+    """Write a part of an image's finest level, (h, w) or (C, h, w); at whole chunks, tiles can be written at once."""
+    level = zarr.open_array(path / "0", mode="r+")
+    level[..., slice(*rows), slice(*columns)] = tile.astype(np.float32)
+
+
+def coarsen(path: Path) -> None:
+    """Make an image's coarser levels from its finest one, a strip at a time: means of what is known."""
+    group = zarr.open_group(path, mode="r+")
+    count = sum(1 for _ in group.array_keys())
+    for level in range(1, count):
+        fine, coarse = (zarr.open_array(path / str(number), mode="r+") for number in (level - 1, level))
+        for top in range(0, coarse.shape[-2], CHUNK):
+            strip = np.asarray(fine[..., 2 * top : 2 * (top + CHUNK), :])
+            coarse[..., top : top + CHUNK, :] = _halved(strip)
+
+
+def _halved(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    odd = [(0, 0)] * (image.ndim - 2) + [(0, side % 2) for side in image.shape[-2:]]
+    padded = np.pad(image, odd, constant_values=np.nan)
+    *lead, rows, columns = padded.shape
+    blocks = padded.reshape(*lead, rows // 2, 2, columns // 2, 2)
+    known = np.isfinite(blocks)
+    total, count = np.where(known, blocks, 0).sum(axis=(-3, -1)), known.sum(axis=(-3, -1))
+    halved: NDArray[np.float32] = np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
+    return halved
+
+
+def _levels(shape: tuple[int, ...]) -> list[tuple[int, ...]]:
+    levels = [shape]
+    while max(levels[-1][-2:]) > CHUNK:
+        levels.append((*shape[:-2], *(-(-side // 2) for side in levels[-1][-2:])))
+    return levels

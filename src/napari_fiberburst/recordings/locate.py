@@ -1,0 +1,172 @@
+"""Where every frame of a recording lies: calibrate the bundle, trace its cores, register the frames, refine them."""
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.calibrate import calibrating, remark
+from napari_fiberburst.bundle.field import find_marks
+from napari_fiberburst.bundle.mount import find_mount
+from napari_fiberburst.bundle.placement import find_bundle
+from napari_fiberburst.bundle.samples import in_grey, only_exposed
+from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.motion.registration import Registration
+from napari_fiberburst.recordings.poses import Poses
+from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.register import registering
+from napari_fiberburst.recordings.traces import Traces, tracing
+from napari_fiberburst.recordings.track import Track
+from napari_fiberburst.recordings.views import middle_of
+from napari_fiberburst.recordings.work import Doing, Work, complete
+from napari_fiberburst.scene.shading import find_shading
+from napari_fiberburst.steps import drain
+
+# The bundle is calibrated from so many frames, spread over the recording.
+_CALIBRATED_FROM = 48
+# Scene and frames are found in turn so many times.
+_ROUNDS = 3
+# The slow changes of the illumination are told by so many frames, spread over the recording.
+_SHADED_FROM = 60
+# Where the frames have seen so many times their own field, the mean of what a core has seen is its gain; on a shorter
+# path the object is in it.
+_WIDE = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Located:
+    """A recording whose frames have their places.
+
+    Attributes
+    ----------
+    work : Work
+        With the bundle, and the traces.
+    traces : Traces
+        What the cores have seen.
+    track : Track
+        Where the frames lie.
+    notes : tuple of str
+        What a user should know.
+    """
+
+    work: Work
+    traces: Traces
+    track: Track
+    notes: tuple[str, ...]
+
+
+def locating(
+    source: FrameSource, folder: Path, *, bundle: Bundle | None, dof: int | None, client: Any | None
+) -> Generator[Doing, None, Located]:
+    """Find the place of every frame; yields how far that is.
+
+    Parameters
+    ----------
+    source : FrameSource
+        The recording.
+    folder : Path
+        For what is found on the way; work that was begun there goes on.
+    bundle : Bundle, optional
+        Where it is known.
+    dof : int, optional
+        2 for shifts alone, 4 for turns and zoom as well; by default as the frames ask for.
+    client : distributed.Client, optional
+        Where to work; by default in this process.
+    """
+    yield Doing("calibrating the bundle", left=1)
+    found, notes = bundle_of(source, bundle)
+    work = Work(source=source, bundle=found, folder=folder)
+    traces = yield from tracing(work, client)
+    poses = yield from registering(work, dof, client)
+    track = _first_track(work, traces, poses)
+    for number in range(_ROUNDS):
+        stage = f"refined-{number}"
+        work.begin(stage)
+        track.save(work.shared(stage))
+        units = refine_units(track)
+        for _, left in complete(refine_unit, stage, work, units, client):
+            yield Doing("refining", number, _ROUNDS, left, len(units))
+        track = refined(track, [Refinement.load(work.path(stage, unit)) for unit in units])
+        if number == 0 and track.pieces and not work.bundle.gains_known:
+            track = _evened(traces, track)
+    return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+
+
+def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:
+    """Return the bundle of a recording, and what a user should know of it: found in the frames, or found again."""
+    numbers = np.unique(np.linspace(0, len(source) - 1, _CALIBRATED_FROM).astype(int)).tolist()
+    grey = in_grey(torch.from_numpy(source.values(numbers)))
+    marks = find_marks(only_exposed(grey))
+    notes = []
+    if given is None:
+        bundle = drain(calibrating(grey, source.acquisition, marks))
+        notes.append(remark(bundle))
+    else:
+        placement = find_bundle(given, grey, source.acquisition)
+        bundle = placement.bundle.masked(marks.numpy())
+        notes.append(placement.note)
+    mount = find_mount(grey)
+    if mount is not None:
+        far = float(np.abs(mount.offsets).max())
+        notes.append(f"the bundle moves on the camera by up to {far:.1f} px, which is not followed; mount it firmly")
+    return bundle, tuple(note for note in notes if note)
+
+
+def _first_track(work: Work, traces: Traces, poses: Poses) -> Track:
+    shape, pitch = work.bundle.shape, work.bundle.pitch
+    count, channels = len(traces), traces.template.values.shape[2]
+    track = Track(
+        scene_from_frame=poses.matrices(middle_of(shape, pitch)),
+        piece=poses.piece,
+        exposures=np.ones(count, np.float32),
+        gains=np.ones((len(work.bundle.centres), channels), np.float32),
+        weights=np.ones(count, np.float32),
+        alike=np.full(count, np.nan),
+        error=float("nan"),
+        shape=shape,
+        dof=poses.dof,
+    )
+    x0, y0, x1, y1 = track.bounds(0) if track.pieces else (0.0, 0.0, 0.0, 0.0)
+    if work.bundle.gains_known or (x1 - x0) * (y1 - y0) < _WIDE * shape[0] * shape[1]:
+        return track
+    mean = traces.summary.mean_light.numpy()
+    gains = np.where(mean > 0, mean / np.median(mean[mean > 0]), 1).astype(np.float32)
+    return replace(track, gains=np.repeat(gains[:, None], channels, axis=1))
+
+
+def _evened(traces: Traces, track: Track) -> Track:
+    """Return the track with the slow changes of the illumination in its gains.
+
+    Scene and gains follow one another where those change slowly over the frame, so that finding them in turn takes many
+    rounds. Some frames of the largest piece tell them at once.
+    """
+    frames = track.frames_of(0)
+    frames = frames[:: max(1, len(frames) // _SHADED_FROM)]
+    samples = traces.samples(frames).without_gains(torch.from_numpy(track.gains))
+    registration = Registration.known(track.scene_from_frame[frames], track.shape, samples.cores)
+    shading = find_shading(samples, replace(registration, exposures=track.exposures[frames]))
+    if shading is None:
+        return track
+    gains = track.gains * shading.gains.numpy()
+    # The frames between those that were asked have the exposures of these.
+    change = np.interp(np.arange(len(track)), frames, shading.exposures.numpy()).astype(np.float32)
+    exposures = np.where(track.piece == 0, track.exposures * change, track.exposures)
+    return replace(track, gains=gains, exposures=exposures)
+
+
+def _remarks(traces: Traces, track: Track) -> tuple[str, ...]:
+    """Return what a user should know of where the frames lie."""
+    notes = []
+    blank = int((~traces.summary.shows).sum())
+    lost = int((traces.summary.shows & (track.piece < 0)).sum())
+    if blank:
+        notes.append(f"{blank} of {len(track)} frames show nothing and were left out")
+    if lost:
+        notes.append(f"{lost} of {len(track)} frames could not be placed and were left out")
+    if track.pieces > 1:
+        notes.append(f"contact was lost or the scene has jumped: the frames make {track.pieces} pieces")
+    return tuple(notes)

@@ -1,0 +1,181 @@
+"""What every core of a bundle has seen in every frame: all that is needed of a recording, at a tenth of its size."""
+
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.samples import SATURATED, Samples, in_grey, sample_cores
+from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.recordings.work import Doing, Work, complete
+from napari_fiberburst.stored import Stored
+
+# The stage that makes traces.
+TRACES = "traces"
+# Frames to a part, which is what one unit of work makes and what is read from the disk at once.
+PART = 64
+# So many parts are kept in memory.
+_KEPT = 32
+# Frames that vary less than this part of the median frame are black, white or empty in another way.
+_LEAST_CONTRAST_OF_USUAL = 0.2
+# A frame with more than this part of its pixels over-exposed is white.
+_MOST_BRIGHT = 0.5
+# Bytes of frames that are looked at together.
+_BYTES_TOGETHER = 2**26
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TracePart(Stored):
+    """What the cores have seen in some frames in a row.
+
+    Attributes
+    ----------
+    values : Tensor
+        (n, N, C), as those of `Samples`.
+    weights : Tensor
+        (n, N), as those of `Samples`.
+    contrast : Tensor
+        (n,), standard deviation of each frame's pixels, full scale 1.
+    bright : Tensor
+        (n,), part of each frame's pixels that are over-exposed.
+    """
+
+    _kind: ClassVar[str] = "part of traces"
+
+    values: Tensor
+    weights: Tensor
+    contrast: Tensor
+    bright: Tensor
+
+
+def trace_part(source: FrameSource, bundle: Bundle, number: int) -> TracePart:
+    """Sample one part of a recording by the cores of a bundle, at the place where it is in these frames."""
+    first = number * PART
+    last = min(first + PART, len(source))
+    together = max(1, _BYTES_TOGETHER // (4 * int(np.prod(source.shape[1:]))))
+    found = []
+    for start in range(first, last, together):
+        frames = torch.from_numpy(source.values(range(start, min(start + together, last))))
+        samples, grey = sample_cores(frames, bundle, source.acquisition), in_grey(frames)
+        contrast, bright = grey.std(dim=(1, 2)), (grey >= SATURATED).float().mean(dim=(1, 2))
+        found.append((samples.values, samples.weights, contrast, bright))
+    values, weights, contrast, bright = (torch.cat(part) for part in zip(*found, strict=True))
+    return TracePart(values=values, weights=weights, contrast=contrast, bright=bright)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Summary(Stored):
+    """What is known of all frames.
+
+    Attributes
+    ----------
+    contrast, bright : Tensor
+        (T,), as those of `TracePart`.
+    mean_light : Tensor
+        (N,), the mean of what each core has seen, grey.
+    """
+
+    _kind: ClassVar[str] = "summary of traces"
+
+    contrast: Tensor
+    bright: Tensor
+    mean_light: Tensor
+
+    @classmethod
+    def of(cls, parts: Iterable[TracePart]) -> "Summary":
+        """Return the summary of all parts."""
+        told: list[tuple[Tensor, Tensor]] = []
+        total = mass = torch.zeros(())
+        for part in parts:
+            told.append((part.contrast, part.bright))
+            shows = _shows(part.contrast, part.bright, float(part.contrast.median()))
+            weights = part.weights * shows[:, None]
+            total = total + (part.values.mean(dim=2) * weights).sum(dim=0)
+            mass = mass + weights.sum(dim=0)
+        contrast, bright = (torch.cat(one) for one in zip(*told, strict=True))
+        return cls(contrast=contrast, bright=bright, mean_light=total / mass.clamp_min(1e-9))
+
+    @property
+    def shows(self) -> NDArray[np.bool_]:
+        """(T,) bool, frames that show something: not all black, white or even."""
+        shown: NDArray[np.bool_] = _shows(self.contrast, self.bright, float(self.contrast.median())).numpy()
+        return shown
+
+
+def _shows(contrast: Tensor, bright: Tensor, usual: float) -> Tensor:
+    return (contrast > _LEAST_CONTRAST_OF_USUAL * usual) & (bright < _MOST_BRIGHT)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Traces:
+    """One value a core and frame.
+
+    Attributes
+    ----------
+    template : Samples
+        Of no frame: what all frames have in common.
+    summary : Summary
+        Of all frames.
+    part : callable
+        Gives each part by its number.
+    """
+
+    template: Samples
+    summary: Summary
+    part: Callable[[int], TracePart]
+
+    @classmethod
+    def of(cls, source: FrameSource, bundle: Bundle, summary: Summary, part: Callable[[int], TracePart]) -> "Traces":
+        """Return the traces of a recording whose parts can be had, such as from files."""
+        template = sample_cores(torch.zeros(1, *source.shape[1:]), bundle, source.acquisition)
+        template = replace(template, values=template.values[:0], weights=template.weights[:0])
+        return cls(template=template, summary=summary, part=lru_cache(maxsize=_KEPT)(part))
+
+    def __len__(self) -> int:
+        return len(self.summary.contrast)
+
+    def samples(self, numbers: Sequence[int] | NDArray[np.int64]) -> Samples:
+        """Return the samples of some frames."""
+        places = [divmod(int(number), PART) for number in numbers]
+        return replace(
+            self.template,
+            values=torch.stack([self.part(part).values[row] for part, row in places]),
+            weights=torch.stack([self.part(part).weights[row] for part, row in places]),
+        )
+
+
+def count_parts(source: FrameSource) -> int:
+    """Return how many parts a recording has."""
+    return -(-len(source) // PART)
+
+
+def trace_unit(work: Work, stage: str, number: int) -> None:
+    """Sample one part of the recording."""
+    trace_part(work.source, work.bundle, number).save(work.path(stage, number))
+
+
+def tracing(work: Work, client: Any | None) -> Generator[Doing, None, Traces]:
+    """Sample the whole recording, a part at a time; yields how far that is."""
+    work.begin(TRACES)
+    units = range(count_parts(work.source))
+    for _, left in complete(trace_unit, TRACES, work, units, client):
+        yield Doing("reading frames", left=left, units=len(units))
+    Summary.of(TracePart.load(work.path(TRACES, number)) for number in units).save(work.shared(TRACES))
+    return traced(work)
+
+
+def traced(work: Work) -> Traces:
+    """Return the traces that units have left; in one process they share what is in memory."""
+    return _opened(work)
+
+
+@lru_cache(maxsize=2)
+def _opened(work: Work) -> Traces:
+    summary = Summary.load(work.shared(TRACES))
+    return Traces.of(work.source, work.bundle, summary, lambda number: TracePart.load(work.path(TRACES, number)))

@@ -1,0 +1,96 @@
+"""Track: where the frames of a recording lie, how bright they are, and what gains their cores have."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from napari_fiberburst.coordinates import transform_points
+from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.stored import Stored
+
+Bounds = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Track(Stored):
+    """Where the frames of a recording lie, and how bright they are.
+
+    Attributes
+    ----------
+    scene_from_frame : numpy.ndarray
+        (T, 3, 3) float64: pixel of a frame to pixel of the first frame of its piece, (x, y).
+    piece : numpy.ndarray
+        (T,) int: frames of one number lie on one scene; -1 for frames that could not be placed.
+    exposures : numpy.ndarray
+        (T,) float32, brightness of each frame relative to the others of its piece.
+    gains : numpy.ndarray
+        (N, C) float32, gain of each core relative to what the traces assume.
+    weights : numpy.ndarray
+        (T,) float32, 0 to 1, how much each frame counts: those that fit worse than others count less.
+    alike : numpy.ndarray
+        (T,) correlation of what each frame shows with the scene that all of them have made, 0 to 1; NaN while that is
+        not known.
+    error : float
+        Root mean square of what the scene misses of samples, full scale 1; NaN while that is not known.
+    shape : (int, int)
+        Height and width of a frame.
+    dof : int
+        2 where frames are only shifted, 4 where they turn and grow as well.
+    """
+
+    _kind: ClassVar[str] = "track"
+
+    scene_from_frame: NDArray[np.float64]
+    piece: NDArray[np.int64]
+    exposures: NDArray[np.float32]
+    gains: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    alike: NDArray[np.float64]
+    error: float
+    shape: tuple[int, int]
+    dof: int
+
+    def __len__(self) -> int:
+        return len(self.piece)
+
+    @property
+    def pieces(self) -> int:
+        """How many scenes there are, each with at least two frames."""
+        return int(self.piece.max(initial=-1)) + 1
+
+    def points(self, numbers: NDArray[np.int64], positions: Tensor) -> Tensor:
+        """Return where positions (N, 2) of frames lie in their scene, (n, N, 2)."""
+        matrices = torch.from_numpy(self.scene_from_frame[numbers]).to(positions.dtype)
+        places: Tensor = transform_points(matrices, positions)
+        return places
+
+    def corners(self, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return where the outer pixels' centres of frames lie in their scene, (n, 4, 2)."""
+        height, width = self.shape
+        outer = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], dtype=np.float64)
+        found: NDArray[np.float64] = transform_points(self.scene_from_frame[numbers], outer)
+        return found
+
+    def frames_of(self, piece: int) -> NDArray[np.int64]:
+        """Return the numbers of a piece's frames."""
+        return np.flatnonzero(self.piece == piece)
+
+    def bounds(self, piece: int) -> Bounds:
+        """Return x0, y0, x1, y1 of all that a piece's frames see."""
+        corners = self.corners(self.frames_of(piece)).reshape(-1, 2)
+        (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
+        return float(x0), float(y0), float(x1), float(y1)
+
+    def touching(self, grid: Grid, piece: int) -> NDArray[np.int64]:
+        """Return the numbers of a piece's frames that see some of a grid."""
+        frames = self.frames_of(piece)
+        corners = self.corners(frames)
+        rows, columns = grid.shape
+        last = (grid.x0 + (columns - 1) * grid.spacing, grid.y0 + (rows - 1) * grid.spacing)
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        touching: NDArray[np.bool_] = ((high >= (grid.x0, grid.y0)) & (low <= last)).all(axis=1)
+        return frames[touching]

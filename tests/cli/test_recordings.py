@@ -1,0 +1,97 @@
+"""Long recordings on the command line."""
+
+import numpy as np
+import pytest
+import tifffile
+from tests.io.clips import drawn, write_clip
+
+from napari_fiberburst import Bundle, read_burst
+from napari_fiberburst.cli import main
+from napari_fiberburst.simulation import simulate
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Return 70 frames of an object that moves by a third of a core distance from each to the next."""
+    motion = np.tile(np.eye(3), (70, 1, 1))
+    motion[:, 0, 2] = 1.5 * np.arange(70)
+    simulated = simulate("histology", shape=(90, 122), frames=70, channels=1, pitch=5.0, motion=motion)
+    return np.rint(255 * simulated.burst.frames[..., 0]).astype(np.uint8)
+
+
+@pytest.fixture
+def clip(tmp_path, monkeypatch, frames):
+    monkeypatch.chdir(tmp_path)
+    return write_clip(tmp_path / "a clip.mkv", "ffv1", "gray", list(frames[[*range(40), 39, *range(40, 70)]]), group=10)
+
+
+def told_of(words, capsys):
+    assert main(["info", *words]) == 0
+    lines = [(line[:15].strip(), line[16:]) for line in capsys.readouterr().out.splitlines()]
+    return dict(lines)
+
+
+def test_info_tells_what_a_video_holds_and_offers_a_burst(clip, capsys):
+    told = told_of(["a clip.mkv"], capsys)
+    assert told["frames"] == "71"
+    assert told["height x width"] == "90 x 122"
+    assert told["codec"] == "ffv1, gray, 8 key frames"
+    assert told["rate"] == "25 frames a second"
+    assert told["length"] == "2.84 s"
+    assert told["doubled frames"] == "1: 40"
+    assert told["levels"] == "black 0, white 255"
+    assert told["shows"].startswith("cores 5.0 px apart")
+    words = told["a good burst"].split()
+    assert told["a good burst"].startswith("fiberburst reconstruct 'a clip.mkv' --frames ")
+    first, stop = map(int, words[words.index("--frames") + 1].split(":"))
+    assert 0 <= first == stop - 20 <= 51
+
+
+def test_info_offers_numbers_of_the_whole_recording(clip, capsys):
+    offered = told_of(["a clip.mkv", "--frames", "8::1"], capsys)["a good burst"].split("--frames ")[1].split()[0]
+    assert int(offered.split(":")[0]) >= 8
+    every_second = told_of(["a clip.mkv", "--frames", "1:60:2"], capsys)
+    assert every_second["frames"] == "30"
+    assert "a good burst" not in every_second
+
+
+def test_info_tells_a_variable_rate(tmp_path, capsys):
+    at = np.cumsum([0, 40, 40, 120, 7, 33, 200, 40]).tolist()
+    write_clip(tmp_path / "a.mkv", "ffv1", "gray", [drawn(number) for number in range(8)], at=at)
+    told = told_of([str(tmp_path / "a.mkv")], capsys)
+    assert told["rate"] == "25 frames a second, variable"
+    assert told["times"] == "0 to 0.48 s"
+
+
+def test_a_rate_whose_times_are_rounded_is_not_variable(tmp_path, capsys):
+    write_clip(tmp_path / "a.mkv", "ffv1", "gray", [drawn(number) for number in range(40)], rate=60)
+    assert told_of([str(tmp_path / "a.mkv")], capsys)["rate"] == "60 frames a second"
+
+
+def test_info_of_a_stack_knows_no_rate(tmp_path, capsys):
+    tifffile.imwrite(tmp_path / "a.tif", np.stack([drawn(number) for number in range(4)]), photometric="minisblack")
+    told = told_of([str(tmp_path / "a.tif")], capsys)
+    assert told["times"] == "unknown"
+    assert told["doubled frames"] == "none"
+    assert not {"rate", "length", "codec", "a good burst"} & set(told)
+
+
+def test_frames_of_a_video_are_reconstructed(clip, capsys):
+    command = ["reconstruct", "a clip.mkv", "-o", "image.tif", "--device", "cpu"]
+    assert main([*command, "--frames", "10:16"]) == 0
+    assert "Burst(6 frames of 90 x 122" in capsys.readouterr().out
+    assert tifffile.imread("image.tif").shape == (90, 122)
+    assert main([*command, "--frames", "100:120"]) == 2
+    assert "has 71 frames, 0 to 70, and none of them is in 100:120" in capsys.readouterr().err
+
+
+def test_frames_of_a_video_calibrate_a_bundle(clip, capsys):
+    assert main(["calibrate", "a clip.mkv", "--frames", "0:70:10", "-o", "a.bundle", "--device", "cpu"]) == 0
+    expected = Bundle.from_burst(read_burst(clip, frames="0:70:10"), device="cpu")
+    np.testing.assert_allclose(Bundle.load("a.bundle").centres, expected.centres)
+
+
+def test_a_file_that_is_no_video_is_said(tmp_path, capsys):
+    (tmp_path / "a.avi").write_text("no video")
+    assert main(["info", str(tmp_path / "a.avi")]) == 2
+    assert "cannot be read as video" in capsys.readouterr().err
