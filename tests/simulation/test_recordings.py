@@ -347,6 +347,16 @@ def test_a_slide_has_no_seams_no_repetition_and_detail_at_all_scales():
     np.testing.assert_allclose(colours.mean(axis=-1), image, atol=1e-5)
 
 
+def test_a_slide_that_glows_is_black_where_the_other_is_clear_and_does_not_saturate():
+    y, x = np.mgrid[:150, :170].astype(float)
+    points = np.stack([x, y], axis=-1)
+    bright, dark = (Slide(seed=2, glows=glows).sample(points) for glows in (False, True))
+    np.testing.assert_allclose(dark / 0.5 + bright / 0.95, 1, atol=1e-5)
+    recording = recorded("fluorescence", cells=20, flash_frames=9, camera=Camera())
+    assert recording.truth(range(0, 40, 5)).max() > 0.5
+    assert recording.source.recorded(range(0, 40, 5)).max() < 255
+
+
 def slide_at(slide):
     return slide.sample(np.array([[40.25, -7.5], [900.0, 31.0], [-80.0, 500.0]]))[0, 0]
 

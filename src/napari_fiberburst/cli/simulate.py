@@ -15,7 +15,7 @@ from napari_fiberburst.io.archive import SIMULATED_ENDING
 from napari_fiberburst.io.folder import read_image
 from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.settings.parameter import parameters_of
-from napari_fiberburst.simulation import MOTIONS, RECORDED_PHYSICS, SCENES, Faults, simulate
+from napari_fiberburst.simulation import ENDLESS_SCENES, MOTIONS, RECORDED_PHYSICS, SCENES, Faults, simulate
 
 _BUNDLE_OPTIONS = ("pitch", "dead_cores", "outline")
 
@@ -36,7 +36,9 @@ def add_to(commands: Any) -> None:
         help="a file ending in .burst; of a recording, in .avi, .mkv or .mp4",
     )
     parser.add_argument(
-        "--scene", choices=("slide", *SCENES), help="what there is to see, default histology; of recordings, slide"
+        "--scene",
+        choices=(*SCENES, *ENDLESS_SCENES),
+        help="what is to be seen, default histology; of recordings, slide",
     )
     parser.add_argument("--shape", type=parse_shape, metavar="HxW", help="default 256x256, or that of --flat")
     parser.add_argument("--frames", type=int, help="default 20; of recordings, 400")

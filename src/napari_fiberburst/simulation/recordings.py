@@ -44,6 +44,8 @@ from napari_fiberburst.simulation.slide import Slide
 
 # As in `simulate`, and as a vendor's display shows it: with the cores filtered out.
 RECORDED_PHYSICS = ("core", "mask", "filtered")
+# Scenes that have no end.
+ENDLESS_SCENES = ("slide", "fluorescence")
 _SHAPE, _FRAMES, _PITCH = (256, 256), 400, 4.7
 # The default step, in parts of the frame's shorter side.
 _STEP = 0.035
@@ -294,7 +296,8 @@ def simulate_recording(
     Parameters
     ----------
     scene : str or World
-        "slide", drawn tissue without end; one of `SCENES`, as far as it reaches; or a scene of your own.
+        "slide", drawn tissue without end, and "fluorescence", the same on black; one of `SCENES`, as far as it reaches;
+        or a scene of your own.
     frames : int, optional
         T. Default 400, or as many as `path` has homographies.
     shape : (int, int), optional
@@ -491,8 +494,8 @@ def _world(
     rng: np.random.Generator,
 ) -> World:
     """Return what there is to see within these bounds, in so many channels."""
-    if scene == "slide":
-        return Slide(seed=int(rng.integers(2**31)), channels=channels)
+    if isinstance(scene, str) and scene in ENDLESS_SCENES:
+        return Slide(seed=int(rng.integers(2**31)), channels=channels, glows=scene == "fluorescence")
     x0, y0, x1, y1 = bounds
     if isinstance(scene, str):
         before = [max(0, math.ceil(-edge)) + _SPLINE_REACH for edge in (x0, y0)]

@@ -32,7 +32,8 @@ _NUCLEUS_RADII, _NUCLEUS_STRETCH = (1.6, 4.2), (1.0, 1.8)
 # Optical densities in red, green and blue of what stains nuclei and what stains the rest.
 _HAEMATOXYLIN = np.array([0.65, 0.70, 0.29], np.float32)
 _EOSIN = np.array([0.07, 0.99, 0.11], np.float32)
-_CLEAR: Final = 0.95
+# Light where nothing is stained, and where all is, in fluorescence.
+_CLEAR, _GLOW = 0.95, 0.5
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,14 @@ class Slide:
         Another one gives other tissue.
     channels : int
         3 are red, green and blue, 1 is their mean; others are bands spread over that spectrum.
+    glows : bool
+        The stains shine on black, as in fluorescence, and leave room for cells that flash; otherwise they take light
+        away from white.
     """
 
     seed: int = 0
     channels: int = 3
+    glows: bool = False
 
     def __post_init__(self) -> None:
         if self.seed < 0 or self.channels < 1:
@@ -106,7 +111,8 @@ def _tile(slide: Slide, column: int, row: int) -> NDArray[np.float32]:
     chromatin = np.exp(0.5 * ground.noise(30, 2, 2))
     haematoxylin = 0.06 * (1 - lumen) + _nuclei(ground, wall, stroma) * chromatin
     density = haematoxylin[None] * _HAEMATOXYLIN[:, None, None] + eosin[None] * _EOSIN[:, None, None]
-    light = (_CLEAR * np.exp(-density))[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    passed = np.exp(-density)[:, _MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    light = _GLOW * (1 - passed) if slide.glows else _CLEAR * passed
     positions = np.linspace(0, 2, slide.channels)
     mixing = np.array([np.interp(positions, range(3), band) for band in np.eye(3)], np.float32)
     if slide.channels == 1:
