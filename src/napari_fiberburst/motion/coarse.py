@@ -16,7 +16,7 @@ from torch import Tensor
 from napari_fiberburst.motion.correlation import OverlapCorrelation
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators import steady
-from napari_fiberburst.operators.filters import blur, local_mean
+from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 
 # Images for the coarse search have at most this many pixels a side.
@@ -72,9 +72,7 @@ def find_shifts(
     spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
     height, width = shape
     grid = Grid.over((0, 0, width - 1, height - 1), spacing)
-    images, mask = even_images(
-        positions, values, weights, grid, smoothed=max(0.5, 0.6 * pitch / spacing), neighbourhood=_NEIGHBOURHOOD
-    )
+    images, mask = _images(positions, values, weights, grid, max(0.5, 0.6 * pitch / spacing))
     count = len(images)
     correlation = OverlapCorrelation(lambda number: (images[number], mask[number]), grid.shape, _KEPT)
     scores = np.zeros((count, count))
@@ -118,44 +116,29 @@ def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> float:
     return max(0.0, float(steady.total(weight * first * second)) / power**0.5) if power > 0 else 0.0
 
 
-def even_images(
-    positions: Tensor, values: Tensor, weights: Tensor, grid: Grid, *, smoothed: float, neighbourhood: float
-) -> tuple[Tensor, Tensor]:
-    """Return frames as small images of one brightness and contrast, and where there is something to see.
-
-    What is bright, large and unlike the object, such as a reflection, would otherwise decide where a frame lies.
-
-    Parameters
-    ----------
-    positions : Tensor
-        (N, 2) frame pixels.
-    values, weights : Tensor
-        (T, N).
-    grid : Grid
-        Of the images.
-    smoothed, neighbourhood : float
-        Sigmas of Gaussians, nodes: of what smooths the images, and of that over which they are evened out.
-
-    Returns
-    -------
-    images : Tensor
-        (T, h, w).
-    mask : Tensor
-        (T, h, w) bool.
-    """
+def _images(positions: Tensor, values: Tensor, weights: Tensor, grid: Grid, sigma: float) -> tuple[Tensor, Tensor]:
+    """Return the frames as small even images (T, h, w), and where there is something to see, (T, h, w)."""
     at = grid.at(positions)
-    light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), smoothed)
-    mass = blur(torch.stack([at.adjoint(w) for w in weights]), smoothed)
+    light = blur(torch.stack([at.adjoint(v * w) for v, w in zip(values, weights, strict=True)]), sigma)
+    mass = blur(torch.stack([at.adjoint(w) for w in weights]), sigma)
     mask = mass > 0.2 * steady.mean(mass)
     images = torch.where(mask, light / mass.clamp_min(1e-9), torch.zeros_like(light))
-    weight = mask.to(images)
-    mean, square = (
-        torch.stack([local_mean(image, neighbourhood, own) for image, own in zip(part, weight, strict=True)])
-        for part in (images, images.square())
-    )
-    contrast = (square - mean.square()).clamp_min(0).sqrt()
+    return torch.stack([evened(*part, _NEIGHBOURHOOD) for part in zip(images, mask, strict=True)]), mask
+
+
+def evened(image: Tensor, mask: Tensor, neighbourhood: float) -> Tensor:
+    """Return an image (h, w) of one brightness and contrast about every pixel, over a Gaussian of so many nodes.
+
+    What is bright, large and unlike the object, such as a reflection, would otherwise decide where a frame lies.
+    """
+    weight = mask.to(image)
+    mean, square, mass = blur(torch.stack([image * weight, image.square() * weight, weight]), neighbourhood)
+    mass = mass.clamp_min(1e-4)
+    mean = mean / mass
+    contrast = (square / mass - mean.square()).clamp_min(0).sqrt()
     usual = contrast[mask].median() if bool(mask.any()) else contrast.new_tensor(1.0)
-    return (images - mean) * weight / (contrast + _LEAST_CONTRAST * usual).clamp_min(1e-9), mask
+    even: Tensor = (image - mean) * weight / (contrast + _LEAST_CONTRAST * usual).clamp_min(1e-9)
+    return even
 
 
 def _pairs(count: int) -> Iterator[tuple[int, int]]:

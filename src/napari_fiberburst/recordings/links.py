@@ -185,15 +185,16 @@ class Linker:
         )
 
     def _stacked(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        images, masks = zip(*(self._views.at(number) for number in numbers), strict=True)
-        return torch.stack(images), torch.stack(masks).float()
+        images, inner = zip(
+            *((self._views.at(number)[0], self._views.inner(number)) for number in numbers), strict=True
+        )
+        return torch.stack(images), torch.stack(inner)
 
     def _linearised(self, second: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Return images (B, P) at the points, what a step changes in them (B, 4, P), and where they are whole."""
         images, masks = second
         along_y, along_x = torch.gradient(images, dim=(1, 2))
-        whole = -torch.nn.functional.max_pool2d(-masks, 3, stride=1, padding=1)
-        at, gx, gy, inside = (part[:, ::_STRIDE, ::_STRIDE].flatten(1) for part in (images, along_x, along_y, whole))
+        at, gx, gy, inside = (part[:, ::_STRIDE, ::_STRIDE].flatten(1) for part in (images, along_x, along_y, masks))
         gx, gy = gx * self._half, gy * self._half
         x, y = self._x, self._y
         return at, torch.stack([x * gx + y * gy, x * gy - y * gx, gx, gy], dim=1), inside

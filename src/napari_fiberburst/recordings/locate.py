@@ -16,8 +16,9 @@ from napari_fiberburst.bundle.placement import find_bundle
 from napari_fiberburst.bundle.samples import in_grey, only_exposed
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.motion.registration import Registration
-from napari_fiberburst.recordings.poses import Poses
-from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.links import Links
+from napari_fiberburst.recordings.poses import Poses, solve_poses
+from napari_fiberburst.recordings.refine import Refinement, larger_model, refine_unit, refine_units, refined
 from napari_fiberburst.recordings.register import registering
 from napari_fiberburst.recordings.traces import Traces, tracing
 from napari_fiberburst.recordings.track import Track
@@ -28,8 +29,12 @@ from napari_fiberburst.steps import drain
 
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
-# Scene and frames are found in turn so many times.
-_ROUNDS = 3
+# Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it.
+_ROUNDS, _MOST_ROUNDS, _WORTH = 3, 8, 0.97
+# Gains and exposures have settled after so many rounds.
+_SETTLED = 2
+# Degrees of freedom of links: frames of fewer are placed anew where they turn.
+_TURNING = 4
 # The slow changes of the illumination are told by so many frames, spread over the recording.
 _SHADED_FROM = 60
 # Where the frames have seen so many times their own field, the mean of what a core has seen is its gain; on a shorter
@@ -81,18 +86,25 @@ def locating(
     found, notes = bundle_of(source, bundle)
     work = Work(source=source, bundle=found, folder=folder)
     traces = yield from tracing(work, client)
-    poses = yield from registering(work, dof, client)
-    track = _first_track(work, traces, poses)
-    for number in range(_ROUNDS):
-        stage = f"refined-{number}"
+    links = yield from registering(work, dof, client)
+    track = _first_track(work, traces, solve_poses(links, len(traces), dof))
+    settled = 0
+    for number in range(_MOST_ROUNDS):
+        stage, before = f"refined-{number}", track
         work.begin(stage)
         track.save(work.shared(stage))
         units = refine_units(track)
         for _, left in complete(refine_unit, stage, work, units, client):
-            yield Doing("refining", number, _ROUNDS, left, len(units))
-        track = refined(track, [Refinement.load(work.path(stage, unit)) for unit in units])
+            yield Doing("refining", number, _MOST_ROUNDS, left, len(units))
+        parts = [Refinement.load(work.path(stage, unit)) for unit in units]
+        track, settled = refined(track, parts), settled + 1
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
+        asked = larger_model(track, parts) if dof is None and settled >= _SETTLED else track.dof
+        if asked > track.dof:
+            track, settled = _with_freedom(work, track, links, asked), 0
+        elif number + 1 >= _ROUNDS and track.error > _WORTH * before.error:
+            break
     return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
 
 
@@ -136,6 +148,15 @@ def _first_track(work: Work, traces: Traces, poses: Poses) -> Track:
     mean = traces.summary.mean_light.numpy()
     gains = np.where(mean > 0, mean / np.median(mean[mean > 0]), 1).astype(np.float32)
     return replace(track, gains=np.repeat(gains[:, None], channels, axis=1))
+
+
+def _with_freedom(work: Work, track: Track, links: Links, dof: int) -> Track:
+    """Return the track with more freedom; where frames may turn, from poses that let them."""
+    if dof > _TURNING:
+        return replace(track, dof=dof)
+    poses = solve_poses(links, len(track), dof)
+    matrices = poses.matrices(middle_of(track.shape, work.bundle.pitch))
+    return replace(track, scene_from_frame=matrices, piece=poses.piece, dof=dof)
 
 
 def _evened(traces: Traces, track: Track) -> Track:

@@ -34,8 +34,10 @@ _EXPOSURE_PRIOR = 1.0
 _MOST_SHIFT, _MOST_EXPOSURE, _MOST_TURN = 2.0, 0.5, 0.02
 # Gains of cores that have seen less than this part of the usual light are left, and no gain changes by more than this.
 _LEAST_LIGHT, _MOST_GAIN = 0.05, 5.0
-# Frames turn and grow where that explains their samples better than noise would, by this ratio in the median.
-_TURNING = 8.0
+# Degrees of freedom: shifts, similarities, affine transforms.
+_MODELS = (2, 4, 6)
+# A larger model is asked for where it explains the median frame better than noise would by this ratio.
+_ASKED = 8.0
 # Frames that are less like the scene than this do not belong to it.
 _LEAST_ALIKE = 0.3
 
@@ -56,8 +58,9 @@ class Refinement(Stored):
         (n,) root mean square of what the scene misses of each frame's samples, full scale 1.
     alike : numpy.ndarray
         (n,) correlation of what each frame shows with what the scene does.
-    turning : numpy.ndarray
-        (n,) by how much turning and growing each frame would explain it better, as a ratio to what noise explains.
+    asked : numpy.ndarray
+        (n, 2) by how much turning and growing, and stretching beside them, would explain each frame better, for each
+        unknown, in mean squares of what the scene misses: what noise alone makes of it is about 1.
     agreement, power : Tensor
         (N, C), sums over the frames of what each core shows times what the scene shows, and of the latter's square.
     """
@@ -69,7 +72,7 @@ class Refinement(Stored):
     exposures: NDArray[np.float32]
     missed: NDArray[np.float64]
     alike: NDArray[np.float64]
-    turning: NDArray[np.float64]
+    asked: NDArray[np.float64]
     agreement: Tensor
     power: Tensor
 
@@ -95,16 +98,11 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
     none = torch.zeros(cores, channels)
     return Refinement(
         frames=frames,
-        **{
-            name: np.concatenate([getattr(part, name) for part in found]) if found else getattr(track, same)[frames]
-            for name, same in (
-                ("scene_from_frame", "scene_from_frame"),
-                ("exposures", "exposures"),
-                ("missed", "alike"),
-                ("alike", "alike"),
-                ("turning", "alike"),
-            )
-        },
+        scene_from_frame=np.concatenate([part.scene_from_frame for part in found] or [np.zeros((0, 3, 3))]),
+        exposures=np.concatenate([part.exposures for part in found] or [np.zeros(0, np.float32)]),
+        missed=np.concatenate([part.missed for part in found] or [np.zeros(0)]),
+        alike=np.concatenate([part.alike for part in found] or [np.zeros(0)]),
+        asked=np.concatenate([part.asked for part in found] or [np.zeros((0, 2))]),
         agreement=sum((part.agreement for part in found), none),
         power=sum((part.power for part in found), none),
     )
@@ -119,7 +117,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     residual = samples.grey - light
     typical = (_sums(weights, residual.square()) / weights.sum(dim=1).clamp_min(1e-9)).sqrt().clamp_min(1e-6)
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
-    exposures, matrices, turning = _stepped(track, frames, points, robust, residual, light, (along_x, along_y))
+    exposures, matrices, asked = _stepped(track, frames, points, robust, residual, light, (along_x, along_y))
     agreement, power = _light(samples, sampling, robust, filtered)
     return Refinement(
         frames=frames,
@@ -127,7 +125,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
         exposures=exposures,
         missed=typical.double().numpy(),
         alike=_correlation(samples.grey, light, weights).double().numpy(),
-        turning=turning / typical.double().numpy() ** 2,
+        asked=asked / typical.double().numpy()[:, None] ** 2,
         agreement=agreement,
         power=power,
     )
@@ -150,32 +148,33 @@ def _stepped(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
     """Return exposures and places of frames after one step of Gauss-Newton each.
 
-    And by how much of the residuals' square a turn and a growth would lower it, half of that for each.
+    And by how much each unknown of the two larger models would lower the residuals' square, (n, 2).
     """
     along_x, along_y = slopes
     half = max(track.shape) / 2
     middle = (points * weights[..., None]).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-9)[:, None]
     x, y = ((points - middle[:, None]) / half).unbind(dim=-1)
-    turns = [half * (x * along_x + y * along_y), half * (x * along_y - y * along_x)]
-    jacobian = torch.stack([light, along_x, along_y, *turns], dim=1)
+    turns = [x * along_x + y * along_y, x * along_y - y * along_x]
+    stretches = [x * along_x - y * along_y, y * along_x + x * along_y]
+    jacobian = torch.stack([light, along_x, along_y, *(half * part for part in turns + stretches)], dim=1)
     weighted = jacobian * weights[:, None]
     normal = weighted @ jacobian.mT
     normal = normal + torch.diag_embed(1e-4 * normal.diagonal(dim1=1, dim2=2) + 1e-9)
     normal[:, 0, 0] += _EXPOSURE_PRIOR
     rhs = (weighted @ residual[..., None])[..., 0]
-    whole = torch.linalg.solve(normal, rhs)
-    shifted = torch.linalg.solve(normal[:, :3, :3], rhs[:, :3])
-    turning = ((whole * rhs).sum(dim=1) - (shifted * rhs[:, :3]).sum(dim=1)) / 2
-    step = (shifted if track.dof == 2 else whole).double().numpy()
+    steps = {dof: torch.linalg.solve(normal[:, : dof + 1, : dof + 1], rhs[:, : dof + 1]) for dof in _MODELS}
+    lowered = [(step * rhs[:, : step.shape[1]]).sum(dim=1) for step in steps.values()]
+    asked = torch.stack([(lowered[1] - lowered[0]) / 2, (lowered[2] - lowered[1]) / 2], dim=1)
+    step = torch.nn.functional.pad(steps[track.dof], (0, 6 - track.dof)).double().numpy()
     exposures = track.exposures[frames] * (1 + step[:, 0].clip(-_MOST_EXPOSURE, _MOST_EXPOSURE)).astype(np.float32)
-    grown, turned = step[:, 3:].clip(-_MOST_TURN, _MOST_TURN).T if track.dof > 2 else np.zeros((2, len(frames)))
+    grown, turned, along, across = step[:, 3:].clip(-_MOST_TURN, _MOST_TURN).T
     change = np.zeros((len(frames), 3, 3))
-    change[:, 0, 0] = change[:, 1, 1] = 1 + grown
-    change[:, 1, 0], change[:, 0, 1], change[:, 2, 2] = turned, -turned, 1
+    change[:, 0, 0], change[:, 1, 1] = 1 + grown + along, 1 + grown - along
+    change[:, 1, 0], change[:, 0, 1], change[:, 2, 2] = turned + across, across - turned, 1
     centre = middle.double().numpy()
     shift = step[:, 1:3].clip(-_MOST_SHIFT, _MOST_SHIFT)
     change[:, :2, 2] = shift + centre - np.einsum("nij,nj->ni", change[:, :2, :2], centre)
-    return exposures, change @ track.scene_from_frame[frames], turning.double().numpy()
+    return exposures, change @ track.scene_from_frame[frames], asked.double().numpy()
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:
@@ -202,7 +201,6 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     ratio = torch.where(known, agreement / power.clamp_min(1e-12), torch.ones_like(power))
     gains = track.gains * ratio.clamp(1 / _MOST_GAIN, _MOST_GAIN).numpy()
     usual = float(np.nanmedian(missed))
-    turning = float(np.median(np.concatenate([part.turning for part in parts])))
     return replace(
         track,
         scene_from_frame=matrices,
@@ -212,8 +210,19 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
         weights=np.nan_to_num((usual / np.maximum(missed, usual)) ** 2).astype(np.float32),
         alike=alike,
         error=usual,
-        dof=4 if turning > _TURNING else track.dof,
     )
+
+
+def larger_model(track: Track, parts: list[Refinement]) -> int:
+    """Return the degrees of freedom that the frames ask for: those they have, or the next more.
+
+    It can be told once gains and exposures have settled; before, what is wrong with them asks for it, too.
+    """
+    if not parts or track.dof == _MODELS[-1]:
+        return track.dof
+    step = _MODELS.index(track.dof)
+    asked = np.concatenate([part.asked for part in parts])[:, step]
+    return _MODELS[step + 1] if len(asked) and np.median(asked) > _ASKED else track.dof
 
 
 def _sums(weights: Tensor, values: Tensor) -> Tensor:

@@ -77,8 +77,8 @@ def _listed(pairs: NDArray[np.int64]) -> list[Pair]:
     return [(int(first), int(second)) for first, second in pairs]
 
 
-def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Doing, None, Poses]:
-    """Find where every frame lies, from traces that are there; yields how far that is.
+def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Doing, None, Links]:
+    """Find which frames see the same place, from traces that are there; yields how far that is.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
         for unit in units:
             links = links + Links.load(work.path(stage, unit))
         poses = solve_poses(links, len(traces), dof)
-    return poses
+    return links
 
 
 def crossings(poses: Poses, side: float) -> list[Pair]:

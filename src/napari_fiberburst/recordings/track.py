@@ -39,7 +39,7 @@ class Track(Stored):
     shape : (int, int)
         Height and width of a frame.
     dof : int
-        2 where frames are only shifted, 4 where they turn and grow as well.
+        2 where frames are only shifted, 4 where they turn and grow as well, 6 where they are stretched, too.
     """
 
     _kind: ClassVar[str] = "track"
