@@ -14,12 +14,6 @@ FIELD = Canvas.over((0, 0, WIDTH, HEIGHT))
 FINER = Canvas.over((-2, 0, WIDTH, HEIGHT + 3), scale=2)
 
 
-@pytest.fixture(scope="session")
-def colour_result(tiny_simulation, fit):
-    """Return a result of frames with three channels."""
-    return fit(tiny_simulation.arrays()["frames"], iterations=1)
-
-
 def ramp(canvas, colours=(), slope=1.0):
     """Return an image that is 100 + slope x (x + 2 y) at each frame pixel (x, y), more in later channels."""
     points = canvas.points()
