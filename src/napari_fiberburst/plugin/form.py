@@ -78,7 +78,7 @@ class SettingsForm(QWidget):
     @property
     def marked(self) -> set[str]:
         """Names of what is marked as away from its default."""
-        rows = {**self._named, **{name: self._rows[name] for name in self.shown}}
+        rows: dict[str, ChoiceRow | ParameterRow] = {**self._named, **{name: self._rows[name] for name in self.shown}}
         return {name for name, row in rows.items() if not row.back.isHidden()}
 
     @property
@@ -293,8 +293,9 @@ class SettingsForm(QWidget):
         for name, row in rows.items():
             if name in defaults:
                 row.compare(defaults[name])
-                layout = self._first if name in _FIRST else self._method
-                layout.labelForField(row).setStyleSheet("" if row.back.isHidden() else _BOLD)
+                label = (self._first if name in _FIRST else self._method).labelForField(row)
+                assert label is not None  # every row has one
+                label.setStyleSheet("" if row.back.isHidden() else _BOLD)
 
     def _value(self, name: str) -> Any:
         return self._device.currentText() if name == "device" else self._rows[name].value
