@@ -1,26 +1,34 @@
-"""How the plugin keeps up with the script: first image, speed, and how long the window is held up.
+"""How the plugin keeps up with the script: first image, speed, how long the window is held up, and what is left behind.
 
-Runs in a window that is drawn, under Xvfb on a machine without a display: `xvfb-run python benchmarks/plugin.py`.
+Runs in a window that is drawn, under Xvfb on a machine without a display: `xvfb-run python benchmarks/plugin.py`. All
+of it, or the parts that are named behind: speed, switches, runs, leaks.
 """
 
 import gc
 import os
+import sys
 import time
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import napari
 import psutil
 from qtpy.QtCore import QEventLoop, QTimer
+from qtpy.QtWidgets import QApplication
 
 from napari_fiberburst import reconstruct
 from napari_fiberburst.plugin.contributions import make_sample
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.simulation import simulate
 
 ROUNDS = 3
 # The published method runs for half a minute, which shows the speed in the long run; the default is done in seconds.
 FITS: dict[str, dict[str, Any]] = {"auto": {}, "paper, 100 steps": {"preset": "paper", "iterations": 100}}
 CYCLES = 100
+KEPT = 50
+# What a large result's card does takes as long whatever the run came to.
+LARGE, SHORT = (1024, 1024), {"motion": "translation", "iterations": 1}
 MEBIBYTE = 2**20
 
 
@@ -33,44 +41,53 @@ def wait_until(is_done: Callable[[], bool], seconds: float = 600) -> None:
 
 
 class Heartbeat:
-    """Notes how long the event loop was away between two turns, longest first."""
+    """Notes when the event loop was away between two turns."""
 
     def __init__(self) -> None:
-        self.gaps: list[float] = []
+        self._turns: list[float] = [time.perf_counter()]
         self._timer = QTimer()
-        self._timer.timeout.connect(self._beat)
-        self._last = time.perf_counter()
+        self._timer.timeout.connect(lambda: self._turns.append(time.perf_counter()))
         self._timer.start(20)
 
-    def _beat(self) -> None:
-        now = time.perf_counter()
-        self.gaps.append(now - self._last)
-        self._last = now
-
-    def stop(self) -> list[float]:
-        """Return the gaps in milliseconds."""
+    def stop(self, layers_at: list[float]) -> tuple[list[float], list[float]]:
+        """Return how long it was away, in milliseconds, longest first: while layers were made, and else."""
         self._timer.stop()
-        return sorted((1e3 * gap for gap in self.gaps), reverse=True)
+        gaps: tuple[list[float], list[float]] = ([], [])
+        for before, after in pairwise(self._turns):
+            is_making = any(before <= made <= after for made in layers_at)
+            gaps[not is_making].append(1e3 * (after - before))
+        return sorted(gaps[0], reverse=True), sorted(gaps[1], reverse=True)
 
 
 def in_plugin(viewer: Any, dock: FiberBurstWidget) -> dict[str, Any]:
     """Run what the form says; return what a user notices."""
     began = time.perf_counter()
-    first: list[float] = []
+    made: list[float] = []
+    previewed = [began]
     rates: list[float] = []
     complete: list[Any] = []
-    seen = viewer.layers.events.inserted.connect(lambda _: first.append(time.perf_counter() - began))
-    reported = dock.picture.runner.reported.connect(lambda report: rates.append(report.rate))
+    seen = viewer.layers.events.inserted.connect(lambda _: made.append(time.perf_counter()))
+    runner = dock.picture.runner
+    reported = runner.reported.connect(lambda report: rates.append(report.rate))
+    shown = runner.previewed.connect(lambda _: previewed.append(time.perf_counter()))
     ended = dock.picture.display.complete.connect(complete.append)
     beat = Heartbeat()
     dock.picture.start()
-    wait_until(lambda: dock.picture.runner.state == "ready")
-    gaps = beat.stop()
+    wait_until(lambda: runner.state == "ready")
     wait_until(lambda: bool(complete))
+    previewed.append(time.perf_counter())
+    making, others = beat.stop(made)
     viewer.layers.events.inserted.disconnect(seen)
-    dock.picture.runner.reported.disconnect(reported)
+    runner.reported.disconnect(reported)
+    runner.previewed.disconnect(shown)
     dock.picture.display.complete.disconnect(ended)
-    return {"first": first[0], "rate": rates[-1], "gaps": gaps}
+    return {
+        "first": made[0] - began,
+        "rate": rates[-1],
+        "making": making,
+        "others": others,
+        "previews": max(after - before for before, after in pairwise(previewed)),
+    }
 
 
 def in_script(frames: Any, choices: dict[str, Any], preview_every: float) -> float:
@@ -88,38 +105,84 @@ def measure_speed() -> None:
         for number in range(ROUNDS):
             found = in_plugin(viewer, dock)
             script = in_script(frames, choices, 0.25)
-            longest = ", ".join(f"{gap:.0f}" for gap in found["gaps"][:3])
-            late = sum(gap > 100 for gap in found["gaps"])
+            longest = ", ".join(f"{gap:.0f}" for gap in found["others"][:3])
+            late = sum(gap > 100 for gap in found["others"])
             print(
-                f"{name:18} {'cold' if number == 0 else 'warm'}: first image {found['first']:.1f} s; "
-                f"{found['rate']:.2f} it/s, script {script:.2f}, ratio {found['rate'] / script:.2f}; window away for "
-                f"{longest} ms at most, over 100 ms {late} times"
+                f"{name:18} {'cold' if number == 0 else 'warm'}: first image {found['first']:.1f} s; no image for "
+                f"{found['previews']:.1f} s at most; {found['rate']:.2f} it/s, script {script:.2f}, ratio "
+                f"{found['rate'] / script:.2f}; window away for {max(found['making'], default=0):.0f} ms when layers "
+                f"are made, else {longest} ms at most, over 100 ms {late} times",
+                flush=True,
             )
         viewer.close()
+
+
+def measure_switches() -> None:
+    """Print how long the window takes to show, and to take away, what each switch on the card of a large run is for."""
+    frames = simulate("histology", shape=LARGE, frames=20, physics="core").arrays()["frames"]
+    viewer = napari.Viewer(show=os.environ.get("QT_QPA_PLATFORM") != "offscreen")
+    viewer.window.resize(1280, 800)
+    viewer.add_image(frames, rgb=True, axis_labels=("t", "y", "x"), name="burst")
+    dock = FiberBurstWidget(viewer)
+    viewer.window.add_dock_widget(dock, name="fiber burst")
+    dock.picture.form.set_choices(SHORT)
+    in_plugin(viewer, dock)
+    wait_until(lambda: False, 3)
+    for kind, switch in dock.picture.display.card.switches.items():
+        if not switch.isHidden():
+            on, off = (_seconds_of_click(switch) for _ in range(2))
+            print(f"switch {kind:16}: on {1e3 * on:.0f} ms, off {1e3 * off:.0f} ms", flush=True)
+    viewer.close()
+
+
+def _seconds_of_click(switch: Any) -> float:
+    """Return how long it takes until a switch has been pressed and the window drawn."""
+    began = time.perf_counter()
+    switch.click()
+    QApplication.processEvents()
+    took = time.perf_counter() - began
+    wait_until(lambda: False, 1)
+    return took
+
+
+def measure_runs() -> None:
+    """Print what many runs that are kept leave behind: layers and memory."""
+    viewer, dock, _ = open_window(is_drawn=os.environ.get("QT_QPA_PLATFORM") != "offscreen")
+    in_plugin(viewer, dock)  # loads what stays loaded
+    layers, before = len(viewer.layers), _resident()
+    for _ in range(KEPT):
+        in_plugin(viewer, dock)
+    after = _resident()
+    print(
+        f"{KEPT} runs, all kept: {(len(viewer.layers) - layers) / KEPT:.1f} layers and "
+        f"{(after - before) / KEPT:.1f} MiB a run ({before:.0f} -> {after:.0f} MiB)",
+        flush=True,
+    )
+    viewer.close()
+
+
+def _resident() -> float:
+    gc.collect()
+    return psutil.Process().memory_info().rss / MEBIBYTE
 
 
 def measure_leaks() -> None:
     """Print what is left after runs that were removed, and after many starts and stops; nothing is drawn here."""
     viewer, dock, _ = open_window(is_drawn=False)
     process = psutil.Process()
-
-    def resident() -> float:
-        gc.collect()
-        return process.memory_info().rss / MEBIBYTE
-
     in_plugin(viewer, dock)  # loads what stays loaded
     remove_runs(dock)
-    before, threads = resident(), process.num_threads()
+    before, threads = _resident(), process.num_threads()
     for _ in range(ROUNDS):
         in_plugin(viewer, dock)
         remove_runs(dock)
-    print(f"{ROUNDS} runs, each removed: memory {before:.0f} -> {resident():.0f} MiB")
+    print(f"{ROUNDS} runs, each removed: memory {before:.0f} -> {_resident():.0f} MiB")
     for _ in range(CYCLES):
         dock.picture.start()
         dock.picture.runner.stop()
         wait_until(lambda: dock.picture.runner.state == "ready")
         remove_runs(dock)
-    after = resident()
+    after = _resident()
     print(
         f"{CYCLES} starts and stops: memory {before:.0f} -> {after:.0f} MiB ({after / before - 1:+.1%}), threads "
         f"{threads} -> {process.num_threads()}, progress bars left {len(napari.utils.progress._all_instances)}"
@@ -145,6 +208,9 @@ def open_window(*, is_drawn: bool) -> tuple[Any, FiberBurstWidget, Any]:
     return viewer, dock, frames
 
 
+PARTS = {"speed": measure_speed, "switches": measure_switches, "runs": measure_runs, "leaks": measure_leaks}
+
+
 if __name__ == "__main__":
-    measure_speed()
-    measure_leaks()
+    for part in sys.argv[1:] or PARTS:
+        PARTS[part]()

@@ -133,6 +133,12 @@ def grey_result(tiny_simulation, fit):
     return fit(tiny_simulation.arrays()["frames"][..., 1], iterations=1)
 
 
+@pytest.fixture(scope="session")
+def colour_result(tiny_simulation, fit):
+    """Return a result of frames with three channels."""
+    return fit(tiny_simulation.arrays()["frames"], iterations=1)
+
+
 @pytest.fixture
 def viewer():
     """Return a viewer without a window."""

@@ -9,7 +9,8 @@ from napari.utils.notifications import notification_manager
 from npe2 import PluginManifest
 from qtpy.QtCore import QEvent, QPoint, Qt
 from qtpy.QtGui import QHelpEvent
-from qtpy.QtWidgets import QApplication, QToolTip
+from qtpy.QtWidgets import QApplication, QFileDialog, QToolTip
+from skimage.io import imread
 
 from napari_fiberburst.plugin import commands
 from napari_fiberburst.plugin.tasks.bundle import BundleTask
@@ -63,6 +64,22 @@ def test_what_cannot_be_done_now_is_said(open_dock, burst_layer):
         notification_manager.records[-1].message
         == f"Stop the run and keep it: not now. {dock.picture.stop_button.toolTip()}"
     )
+
+
+def test_the_figure_is_saved_by_its_command_once_there_is_an_image(
+    open_dock, burst_layer, run_through, qtbot, monkeypatch, tmp_path
+):
+    path = tmp_path / "figure.png"
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_: (str(path), ""))
+    _, dock = open_dock(burst_layer)
+    for name in ("figure", "report"):
+        commands.press(name)
+        assert "not now" in notification_manager.records[-1].message
+    run_through(dock)
+    commands.figure()
+    box = dock.picture.display.card.report
+    qtbot.waitUntil(lambda: "figure of run 1 is in" in box.words.text(), timeout=MILLISECONDS)
+    assert imread(path).shape[1] > imread(path).shape[0]
 
 
 def test_start_opens_the_dock_and_the_others_say_that_it_is_closed(make_napari_viewer, npe2pm):

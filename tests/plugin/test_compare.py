@@ -7,17 +7,12 @@ import pytest
 from napari.layers import Image
 
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.plugin.runs import RunsPanel
 
 HEIGHT, WIDTH = 31, 37
 FIELD = Canvas.over((0, 0, WIDTH, HEIGHT))
 # Twice as fine, and two pixels further to the left and three to the bottom.
 FINER = Canvas.over((-2, 0, WIDTH, HEIGHT + 3), scale=2)
-
-
-@pytest.fixture(scope="session")
-def colour_result(tiny_simulation, fit):
-    """Return a result of frames with three channels."""
-    return fit(tiny_simulation.arrays()["frames"], iterations=1)
 
 
 def ramp(canvas, colours=(), slope=1.0):
@@ -293,6 +288,32 @@ def test_whatever_happens_ends_it_without_a_trace(grey, kept_run, qtbot, way, de
     assert shown(viewer) == left
     assert [layer.name for layer in viewer.layers if layer.name != "burst"] == left
     assert not viewer.canvas.grid.enabled
+
+
+@pytest.mark.parametrize("way", ["flicker", "side by side"])
+@pytest.mark.parametrize("first", ["flicker", "side by side"])
+def test_of_two_docks_that_compare_the_later_one_takes_over(grey, qtbot, kept_run, grey_result, first, way):
+    viewer, panel, _ = grey
+    other = RunsPanel(viewer)
+    qtbot.addWidget(other)
+    result = replace(grey_result, image=ramp(FIELD), canvas=FIELD)
+    other.add(kept_run(viewer, [viewer.layers["burst"]], "TYX", result, "run 3"))
+    viewer.layers["run 1: image"].visible = False
+    before, zoom = shown(viewer), viewer.scene.camera.zoom
+    press(viewer, panel, first, "run 1")
+    press(viewer, other, way, "as recorded")
+    qtbot.wait(50)  # what ends late would end now
+    assert not panel.compare.button.isChecked()
+    assert panel.compare.flip.isHidden()
+    assert other.compare.button.isChecked()
+    assert {name[:1] for name in shown(viewer)} <= {"A", "B"}
+    assert viewer.canvas.grid.enabled == (way == "side by side")
+    other.compare.stop()
+    panel.compare.stop()
+    assert shown(viewer) == before
+    assert viewer.scene.camera.zoom == zoom
+    assert not viewer.canvas.grid.enabled
+    assert len(viewer.layers) == 4
 
 
 def test_a_run_that_goes_on_does_not_end_it(grey):

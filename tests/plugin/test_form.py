@@ -76,6 +76,50 @@ def test_a_preset_sets_everything_back(form):
     assert form.choices() == {}
 
 
+def go_back(form, name):
+    """Press the mark at a setting's row."""
+    row = form.rows.get(name) or form.boxes[name].parentWidget()
+    assert row.back.accessibleName().startswith(name.replace("_", " "))
+    row.back.click()
+
+
+def test_what_is_not_its_default_is_marked_at_its_row_and_goes_back_at_a_click(form, qtbot):
+    assert form.marked == set()
+    form.set_choices({"motion": "affine", "upsample": 3.0, "smoothness": 0.125, "device": "cpu"})
+    assert form.marked == {"motion", "upsample", "smoothness", "device"}
+    for name in ("smoothness", "motion", "device"):
+        with qtbot.waitSignal(form.changed):
+            go_back(form, name)
+    assert form.choices() == {"upsample": 3.0}
+    assert form.marked == {"upsample"}
+    form.rows["upsample"].editor.value = 1.0
+    assert form.marked == set()
+
+
+def test_defaults_are_those_of_the_preset_and_the_method_that_are_chosen(form):
+    form.set_choices({"preset": "paper"})
+    assert form.marked == {"preset"}
+    form.boxes["encoding"].setCurrentText("siren")
+    assert form.marked == {"preset", "encoding"}, "what comes with an encoding is its own default"
+    form.rows["omega_0"].editor.value = 7.5
+    assert form.marked == {"preset", "encoding", "omega_0"}
+    go_back(form, "omega_0")
+    go_back(form, "encoding")
+    go_back(form, "preset")
+    assert form.choices() == {}
+    form.take_usual({"preset": "paper", "device": "cpu"})
+    assert form.marked == {"preset", "device"}
+
+
+def test_choices_that_do_not_go_together_have_a_way_back(form):
+    form.boxes["motion"].setCurrentText("flow")
+    form.boxes["encoding"].setCurrentText("spline")
+    assert form.problem
+    assert "motion" in form.marked
+    go_back(form, "motion")
+    assert form.problem == ""
+
+
 def test_tooltips_are_the_settings_own_words(form):
     parameter = choose().parameters["upsample"]
     assert parameter.doc in form.rows["upsample"].toolTip()

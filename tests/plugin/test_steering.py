@@ -48,6 +48,13 @@ def click_on_outline(viewer, modifiers=("Control",)):
         callback(viewer, event)
 
 
+def distance_to(corners, points):
+    """Return how far points (N, 2) lie from the outline of a polygon."""
+    starts, ways = corners, np.roll(corners, -1, axis=0) - corners
+    along = np.clip(((points[:, None] - starts) * ways).sum(-1) / (ways**2).sum(-1), 0, 1)
+    return np.linalg.norm(points[:, None] - starts - along[..., None] * ways, axis=-1).min(axis=1)
+
+
 def test_the_picture_follows_the_slider_and_is_judged_at_rest(ran, qtbot):
     viewer, dock, run = ran
     box, before, first = dock.picture.display.card.steering, shown(viewer).copy(), run.result
@@ -111,14 +118,21 @@ def test_what_rests_on_the_old_result_is_gone_until_there_is_a_new_one(ran, qtbo
 def test_a_click_on_an_outline_leaves_its_frame_out_and_brings_it_back(ran, qtbot):
     viewer, dock, run = ran
     box, layer = dock.picture.display.card.steering, viewer.layers["run 1: outlines"]
-    usual, width = layer.edge_color[0].copy(), layer.edge_width[0]
+    usual = layer.edge_color[0].copy()
     viewer.dims.set_current_step(0, 5)
     click_on_outline(viewer, modifiers=())
     assert run.result is not None, "a plain click moves the view"
     click_on_outline(viewer)
     assert box.frames.text() == "5"
-    assert not np.array_equal(layer.edge_color[5], usual)
-    assert layer.edge_width[5] < width
+    assert layer.edge_color[5][3] == 0, "of a frame left out only dashes are seen"
+    lines = [np.asarray(ends) for ends, kind in zip(layer.data, layer.shape_type, strict=True) if kind == "line"]
+    assert {tuple(ends[:, 0]) for ends in lines} == {(5.0, 5.0)}
+    corners = layer.data[5][:, 1:]
+    around = sum(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1))
+    dashed = sum(np.linalg.norm(np.diff(ends[:, 1:], axis=0)) for ends in lines)
+    assert dashed == pytest.approx(around / 2, rel=1e-3)
+    for ends in lines:
+        np.testing.assert_allclose(distance_to(corners, ends[:, 1:]), 0, atol=1e-3)
     np.testing.assert_array_equal(layer.edge_color[4], usual)
     result = judged(qtbot, run)
     assert 5 not in result.frames_used
@@ -128,6 +142,7 @@ def test_a_click_on_an_outline_leaves_its_frame_out_and_brings_it_back(ran, qtbo
     click_on_outline(viewer)
     assert judged(qtbot, run).frames_used == tuple(range(8))
     np.testing.assert_array_equal(layer.edge_color[5], usual)
+    assert set(layer.shape_type) == {"polygon"}
 
 
 def test_outlines_are_not_clicked_while_somebody_draws(ran):

@@ -63,6 +63,9 @@ COMMANDS = {
     ),
     "save": Command(title="Save the result", key="Ctrl-Shift-S", widget=lambda dock: dock.picture.runs.save.result),
     "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
+    "figure": Command(
+        title="Save a figure", key=None, widget=lambda dock: dock.picture.display.card.report.figure_button
+    ),
     "next_run": Command(
         title="Next run",
         key="Ctrl-Shift-Down",
@@ -140,7 +143,8 @@ def press(name: str) -> None:
 
 
 start, pause, stop = partial(press, "start"), partial(press, "pause"), partial(press, "stop")
-compare, save, report = partial(press, "compare"), partial(press, "save"), partial(press, "report")
+compare, save = partial(press, "compare"), partial(press, "save")
+report, figure = partial(press, "report"), partial(press, "figure")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
 
 

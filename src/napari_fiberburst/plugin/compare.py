@@ -62,7 +62,7 @@ class CompareBox(QWidget):
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
         self._soon.timeout.connect(self.stop)
-        self._stage = Stage(viewer, self._soon.start)
+        self._stage = Stage(viewer, self._soon.start, self.stop)
         self._a: KeptRun | None = None
         self._offered: list[tuple[KeptRun, str]] = []
         self._sides: tuple[list[Any], list[Any]] = ([], [])

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # What there is, in the order it is offered.
 KINDS = {
     "outlines": "Where each frame lies on the image; follows the slider. Ctrl + click (Cmd on a Mac) inside one leaves "
-    "its frame out, or takes it in again; one that is left out is grey and thin.",
+    "its frame out, or takes it in again; one that is left out is dashed and grey.",
     "path": "The way of the frames' centres.",
     "coverage": "How many core samples saw each pixel; 0 is filled in from the surroundings.",
     "frames": "How many frames have seen each pixel.",
@@ -34,8 +34,8 @@ KINDS = {
 # Those that are known while a run goes: they follow from the motion alone.
 MOTION_KINDS = ("outlines", "path")
 _EDGE, _TRACK_COLOURS = "#ffb000", "turbo"
-# Of the outline of a frame that was left out, which is thinner too.
-_GREY, _THIN = "#909090", 0.5
+# Of a frame that was left out: its dashes, so many a side, and its outline, which can be clicked all the same.
+_GREY, _UNSEEN, _DASHES = "#909090", "transparent", 9
 # Outlines of frames that bend have so many points a side; arrows that show how, so many along the frame's longer side,
 # and are so much longer than the way they show.
 _PER_SIDE, _ARROWS, _ENLARGED = 12, 16, 3.0
@@ -110,28 +110,53 @@ def kinds_of(result: "Reconstruction", placement: Placement) -> tuple[str, ...]:
 
 
 def outlines(motion: Motion, placement: Placement) -> Any:
-    """Return a polygon for each frame, as a Shapes layer takes them."""
+    """Return a polygon for each frame, then the dashes of those left out, as a Shapes layer takes them."""
     height, width = motion.shape
-    sides = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    sides = corners
     if motion.shift is not None:
-        sides = np.linspace(sides, np.roll(sides, -1, axis=0), _PER_SIDE, axis=1)[:, :-1].reshape(-1, 2)
-    return [one for frame in motion.known for one in placement.vertices(motion.moved(sides, frame), frame)]
+        sides = np.linspace(corners, np.roll(corners, -1, axis=0), _PER_SIDE, axis=1)[:, :-1].reshape(-1, 2)
+    drawn = [
+        (one, "polygon") for frame in motion.known for one in placement.vertices(motion.moved(sides, frame), frame)
+    ]
+    for frame in _left_out(motion):
+        for ends in _dashes(corners):
+            drawn += [(one, "line") for one in placement.vertices(motion.moved(ends, frame), frame)]
+    return drawn
 
 
 def outlined_frames(motion: Motion, placement: Placement) -> list[int]:
-    """Return the frame of each polygon of `outlines`."""
-    each = int(np.prod([placement.sizes[axis] for axis in placement.axes if axis not in "TYX"]))
-    return [frame for frame in motion.known for _ in range(each)]
+    """Return the frame of each shape of `outlines`."""
+    dashed = [frame for frame in _left_out(motion) for _ in range(4 * _DASHES)]
+    return [frame for frame in (*motion.known, *dashed) for _ in range(_positions(placement))]
 
 
 def outline_look(motion: Motion, placement: Placement) -> dict[str, Any]:
-    """Return colour and width of each outline: those of frames left out are grey and thin."""
-    usual = max(1.0, motion.shape[1] / _FRAME_PER_EDGE)
-    is_out = [frame in motion.left_out for frame in outlined_frames(motion, placement)]
+    """Return colour and width of each shape of `outlines`: of a frame left out, only grey dashes are seen."""
+    frames, polygons = outlined_frames(motion, placement), len(motion.known) * _positions(placement)
+    colours = [_UNSEEN if frame in motion.left_out else _EDGE for frame in frames[:polygons]]
     return {
-        "edge_color": [_GREY if out else _EDGE for out in is_out],
-        "edge_width": [usual * (_THIN if out else 1.0) for out in is_out],
+        "edge_color": colours + [_GREY] * (len(frames) - polygons),
+        "edge_width": [max(1.0, motion.shape[1] / _FRAME_PER_EDGE)] * len(frames),
     }
+
+
+def _positions(placement: Placement) -> int:
+    """Return at how many positions of other axes each shape is drawn."""
+    return int(np.prod([placement.sizes[axis] for axis in placement.axes if axis not in "TYX"]))
+
+
+def _left_out(motion: Motion) -> list[int]:
+    return [frame for frame in motion.known if frame in motion.left_out]
+
+
+def _dashes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return both ends (N, 2, 2) of each dash along the sides between corners (4, 2)."""
+    # A dash is as long as a gap, and each side begins and ends with half a gap.
+    begin = (np.arange(_DASHES) + 0.25) / _DASHES
+    at = np.stack([begin, begin + 0.5 / _DASHES], axis=1)[:, :, None]
+    ways = np.roll(corners, -1, axis=0) - corners
+    return np.concatenate([corner + at * way for corner, way in zip(corners, ways, strict=True)])
 
 
 def path(motion: Motion, placement: Placement) -> Any:
@@ -147,7 +172,7 @@ def motion_layer(kind: str, motion: Motion, placement: Placement) -> Layer:
     """Make the layer of outlines or of the path."""
     placed = placement.on_canvas(placement.axes)
     if kind == "outlines":
-        look = {"shape_type": "polygon", "face_color": "transparent", **outline_look(motion, placement)}
+        look = {"face_color": "transparent", **outline_look(motion, placement)}
         return Shapes(outlines(motion, placement), **look, **placed)
     return Tracks(path(motion, placement), tail_length=len(motion.homographies), colormap=_TRACK_COLOURS, **placed)
 

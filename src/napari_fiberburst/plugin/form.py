@@ -8,6 +8,7 @@ from qtpy.QtGui import QStandardItemModel
 from qtpy.QtWidgets import QComboBox, QFormLayout, QLabel, QVBoxLayout, QWidget
 
 from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.plugin.back import ChoiceRow
 from napari_fiberburst.plugin.parameter_rows import ParameterRow
 from napari_fiberburst.plugin.sections import form_layout, section
 from napari_fiberburst.settings import (
@@ -19,11 +20,13 @@ from napari_fiberburst.settings import (
     choose,
 )
 
-# Shown at once, in this order; the rest is in the section below, but for what the plugin itself decides, and the result
-# card turns.
-_FIRST = ("sigma", "smoothness", "iterations", "time_budget", "device", "canvas", "upsample")
+# Shown at once, in this order; all else is of the method, in the section below, where some come first; but for what the
+# plugin itself decides, and the result card turns.
+_FIRST = ("smoothness", "upsample", "canvas", "fill", "iterations", "time_budget", "device")
+_METHOD_FIRST = ("sigma", "learning_rate")
 _NOT_SHOWN = ("preview_every", "leave_out")
 _LIVE = ("sigma", "learning_rate")
+_BOLD = "font-weight: bold;"
 _DEVICES = ("auto", "cpu", "cuda", "mps")
 _PRESET_TEXTS = {
     "auto": "The burst calibrates its own bundle; seconds.",
@@ -46,15 +49,16 @@ class SettingsForm(QWidget):
     def __init__(self, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self.problem = ""
-        self._preset, self._motion, self._encoding = (QComboBox() for _ in range(3))
-        self._device = QComboBox()
+        self._usual: Mapping[str, Any] = {}
+        self._named = {name: ChoiceRow(name) for name in ("preset", "motion", "encoding", "device")}
+        self._preset, self._motion, self._encoding, self._device = (row.box for row in self._named.values())
         self._device.addItems(_DEVICES)
         parameters = all_keywords()
         self._device.setToolTip(parameters.pop("device").doc)
         self._rows = {
             name: ParameterRow(parameter, self) for name, parameter in parameters.items() if name not in _NOT_SHOWN
         }
-        self._first, self._rest = form_layout(), form_layout()
+        self._first, self._method = form_layout(), form_layout()
         self._settings = PRESETS["auto"]
         self._is_running = False
         self._lay_out()
@@ -69,7 +73,13 @@ class SettingsForm(QWidget):
     @property
     def boxes(self) -> Mapping[str, QComboBox]:
         """Where preset, motion, encoding and device are chosen."""
-        return {"preset": self._preset, "motion": self._motion, "encoding": self._encoding, "device": self._device}
+        return {name: row.box for name, row in self._named.items()}
+
+    @property
+    def marked(self) -> set[str]:
+        """Names of what is marked as away from its default."""
+        rows: dict[str, ChoiceRow | ParameterRow] = {**self._named, **{name: self._rows[name] for name in self.shown}}
+        return {name for name, row in rows.items() if not row.back.isHidden()}
 
     @property
     def shown(self) -> set[str]:
@@ -77,7 +87,7 @@ class SettingsForm(QWidget):
         return {
             name
             for name, row in self._rows.items()
-            if any(layout.indexOf(row) >= 0 and layout.isRowVisible(row) for layout in (self._first, self._rest))
+            if any(layout.indexOf(row) >= 0 and layout.isRowVisible(row) for layout in (self._first, self._method))
         }
 
     @property
@@ -119,6 +129,11 @@ class SettingsForm(QWidget):
         self._fill(preset, known)
         self.changed.emit()
 
+    def take_usual(self, usual: Mapping[str, Any]) -> None:
+        """Take the user's preferences, as `choices` returns them, for the defaults."""
+        self._usual = usual
+        self._mark()
+
     def show_chosen(self, settings: Settings) -> None:
         """Say what a run has chosen for parameters that were left open."""
         for name, row in self._rows.items():
@@ -128,8 +143,8 @@ class SettingsForm(QWidget):
     def set_running(self, is_running: bool, *, is_network: bool = False) -> None:
         """Lock all but what a running fit follows; sigma and the learning rate are a network's."""
         self._is_running = is_running
-        for widget in (self._preset, self._motion, self._encoding, self._device):
-            widget.setEnabled(not is_running)
+        for choice in self._named.values():
+            choice.setEnabled(not is_running)
         for name, row in self._rows.items():
             row.setEnabled(not is_running or (name in _LIVE and is_network))
 
@@ -157,18 +172,16 @@ class SettingsForm(QWidget):
         self._preset.setToolTip("Where settings start from; choosing one sets everything back to it.")
         self._motion.setToolTip("How the object moves between frames.")
         self._encoding.setToolTip("How the scene is held while it is fitted.")
-        for label, box in (("preset", self._preset), ("motion", self._motion), ("encoding", self._encoding)):
-            box.setAccessibleName(label)
-            self._first.addRow(label, box)
-        self._device.setAccessibleName("device")
-        for name in _FIRST:
-            row = self._device if name == "device" else self._rows[name]
-            self._first.addRow(name.replace("_", " "), row)
-        for name, row in self._rows.items():
-            if name not in _FIRST:
-                self._rest.addRow(row.label, row)
-        hidden = QWidget()
-        hidden.setLayout(self._rest)
+        rows: dict[str, QWidget] = {**self._rows, **self._named}
+        others = [name for name in self._rows if name not in (*_FIRST, *_METHOD_FIRST)]
+        for layout, order in (
+            (self._first, _FIRST),
+            (self._method, ("preset", "motion", "encoding", *_METHOD_FIRST, *others)),
+        ):
+            for name in order:
+                layout.addRow(name.replace("_", " "), rows[name])
+        method = QWidget()
+        method.setLayout(self._method)
         self._hint = QLabel()
         self._hint.setWordWrap(True)
         self._hint.setVisible(False)
@@ -176,7 +189,7 @@ class SettingsForm(QWidget):
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addLayout(self._first)
         whole.addWidget(self._hint)
-        whole.addWidget(section("More settings", hidden))
+        whole.addWidget(section("Method", method))
 
     def _connect(self) -> None:
         self._preset.currentTextChanged.connect(self._take_preset)
@@ -192,6 +205,7 @@ class SettingsForm(QWidget):
 
     def _turn(self, name: str) -> None:
         if self._is_running:
+            self._mark()
             self.turned_live.emit(name, self._rows[name].value)
         else:
             self._follow()
@@ -205,7 +219,8 @@ class SettingsForm(QWidget):
                 # The other family of motions comes with its own values.
                 self._show(choose(self.preset, observation=observation))
             else:
-                base = choose(self._settings, **named)
+                # From the preset: what was set once and is left open again must not come back.
+                base = choose(self.preset, observation=observation, **named)
                 before = self._settings.flat()
                 if any(before[part] != chosen for part, chosen in named.items()):
                     self._show(choose(base, **self._shared(base)))
@@ -215,6 +230,7 @@ class SettingsForm(QWidget):
             self.problem = str(error)
         self._hint.setText(self.problem)
         self._hint.setVisible(bool(self.problem))
+        self._mark()
         self.changed.emit()
 
     def _shared(self, base: Settings) -> dict[str, Any]:
@@ -248,17 +264,38 @@ class SettingsForm(QWidget):
         self._device.setCurrentText(settings.device)
         for box in (self._motion, self._encoding, self._device):
             box.blockSignals(False)
-        for layout in (self._first, self._rest):
+        for layout in (self._first, self._method):
             for number in range(layout.rowCount()):
                 item = layout.itemAt(number, QFormLayout.ItemRole.FieldRole)
                 row = None if item is None else item.widget()
                 if isinstance(row, ParameterRow):
                     layout.setRowVisible(number, row.parameter.name in settings.parameters)
-        base = choose(self.preset, **{name: flat[name] for name in ("observation", "motion", "encoding")})
+        base = self._base()
         for name in settings.parameters:
             if name in self._rows:
                 self._rows[name].set_value(flat[name])
                 self._rows[name].allow_open(base.value_of(name) is None)
+        self._mark()
+
+    def _base(self) -> Settings:
+        """Return the settings of a form on which motion and encoding, but nothing else, have been chosen."""
+        flat = self._settings.flat()
+        return choose(self.preset, **{name: flat[name] for name in ("observation", "motion", "encoding")})
+
+    def _mark(self) -> None:
+        """Mark each row whose value is not its default."""
+        base, start = self._base(), choose(self.preset, observation=self._settings.value_of("observation"))
+        fitting = choose(start, encoding=self._settings.flat()["encoding"])  # networks have no motion "auto"
+        defaults = {name: base.value_of(name) for name in base.parameters}
+        defaults |= {"observation": PRESETS[self.preset].value_of("observation"), "preset": next(iter(PRESETS))}
+        defaults |= {"motion": fitting.flat()["motion"], "encoding": start.flat()["encoding"], **self._usual}
+        rows: dict[str, ChoiceRow | ParameterRow] = {**self._rows, **self._named}
+        for name, row in rows.items():
+            if name in defaults:
+                row.compare(defaults[name])
+                label = (self._first if name in _FIRST else self._method).labelForField(row)
+                assert label is not None  # every row has one
+                label.setStyleSheet("" if row.back.isHidden() else _BOLD)
 
     def _value(self, name: str) -> Any:
         return self._device.currentText() if name == "device" else self._rows[name].value

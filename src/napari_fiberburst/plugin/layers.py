@@ -58,6 +58,7 @@ class RunLayers:
         self._layers: dict[str, Layer] = {}
         self._places: dict[int, Layer] = {}
         self._is_removed = False
+        self._drawn: NDArray[np.float32] | None = None
         self._drawn_at: NDArray[np.float64] | None = None
         self._limits: dict[str, tuple[float, float]] = {}
         self._outlined = self._outlining = 0.0
@@ -76,6 +77,11 @@ class RunLayers:
         """The layers of the image that are still in the viewer."""
         return [layer for kind, layer in self._layers.items() if _is_image(kind) and self._has(layer)]
 
+    @property
+    def shown(self) -> NDArray[np.float32] | None:
+        """The image that they show, as it was given; None before the first one."""
+        return self._drawn
+
     def show_image(self, image: NDArray[np.float32], acquisition: Acquisition, canvas: "Canvas") -> None:
         """Show an image (H, W) or (H, W, C) in intensity units, in the layers that are there for it, or new ones."""
         for number, (kind, data, axes) in enumerate(self.placement.parts(image, acquisition)):
@@ -90,7 +96,7 @@ class RunLayers:
                         setattr(layer, attribute, value)
                 self._fit_contrast(kind, layer, data)
                 layer.data = data
-        self._drawn_at = canvas.reference_from_image
+        self._drawn, self._drawn_at = image, canvas.reference_from_image
 
     def show_frames(self, homographies: NDArray[np.float64], shape: tuple[int, int]) -> None:
         """Take in where each frame (H, W) lies on the image; where that is switched on, show it now and then."""
@@ -220,7 +226,7 @@ class RunLayers:
         self.take_out()
         self._layers.clear()
         self._places = {}
-        self._result = self._frames = self._motion = None
+        self._result = self._frames = self._motion = self._drawn = None
 
     def _fit_contrast(self, kind: str, layer: Image, data: NDArray[np.float32]) -> None:
         """Follow the image with the contrast, until the user takes it in hand."""

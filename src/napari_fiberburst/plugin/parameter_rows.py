@@ -10,6 +10,7 @@ from qtpy.QtCore import Signal
 from qtpy.QtGui import QValidator
 from qtpy.QtWidgets import QAbstractSpinBox, QCheckBox, QDoubleSpinBox, QHBoxLayout, QWidget
 
+from napari_fiberburst.plugin.back import BackButton
 from napari_fiberburst.settings.parameter import Parameter
 
 # A bound for numbers that have none, and the least number that counts as above 0.
@@ -71,6 +72,8 @@ class ParameterRow(QWidget):
         Shows and changes the value.
     auto : QCheckBox or None
         Checked where the parameter is left open; None where it cannot be.
+    back : BackButton
+        Seen while the value is not the default.
     """
 
     changed = Signal()
@@ -80,6 +83,8 @@ class ParameterRow(QWidget):
         self.parameter = parameter
         self.editor = _editor(parameter)
         self.auto = QCheckBox("auto") if parameter.optional else None
+        self.back = BackButton(self.label)
+        self._default = parameter.default
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
         row.addWidget(self.editor.native, 1)
@@ -88,6 +93,8 @@ class ParameterRow(QWidget):
             self.auto.setToolTip(f"Leave {self.label} open.")
             self.auto.setAccessibleName(f"{self.label}: auto")
             self.auto.toggled.connect(self._follow_auto)
+        row.addWidget(self.back)
+        self.back.clicked.connect(self._go_back)
         self.editor.native.setAccessibleName(self.label)
         for part in (self, self.editor.native):
             part.setToolTip(f"{parameter.doc}\n({parameter.name}: {parameter.expected})")
@@ -120,6 +127,11 @@ class ParameterRow(QWidget):
         if self.auto is not None:
             self.auto.setVisible(is_allowed)
 
+    def compare(self, default: Any) -> None:
+        """Mark whether the value is another one than the default."""
+        self._default = default
+        self.back.compare(self.value, default)
+
     def show_chosen(self, value: Any) -> None:
         """Say which value a run has chosen for an open parameter."""
         if self.auto is None or not self.auto.isChecked():
@@ -128,6 +140,10 @@ class ParameterRow(QWidget):
         self.auto.setText("auto" if value is None else f"auto ({number})")
         if value is not None:
             self._show(value)
+
+    def _go_back(self) -> None:
+        self.set_value(self._default)
+        self.changed.emit()
 
     def _show(self, value: Any) -> None:
         if isinstance(self.editor, RangedWidget):  # magicgui refuses what is out of range

@@ -151,6 +151,11 @@ class Placement:
         frame = round((at - self.translate[axis]) / self.scale[axis])
         return frame if 0 <= frame < self.sizes["T"] else None
 
+    def pixel_at(self, point: Sequence[float]) -> tuple[int, int]:
+        """Return row and column of the pixel at a point of one of its layers, in that layer's own coordinates."""
+        axes = self.axes[-len(point) :]  # as `arrange` leaves them
+        return round(float(point[axes.index("Y")])), round(float(point[axes.index("X")]))
+
     def vertices(self, points: NDArray[np.float64], frame: int) -> list[NDArray[np.float64]]:
         """Return frame-0 points (N, 2) as (x, y) in the axes of a layer of shapes, once per position of other axes.
 

@@ -25,7 +25,7 @@ class ReportBox(QWidget):
     Attributes
     ----------
     button, figure_button : QPushButton
-        Locked while one of them is written.
+        Locked while one of them is written, and where there is no result.
     words : QLabel
         Where the last one is, as a link that opens it; or why there is none.
     """
@@ -61,9 +61,10 @@ class ReportBox(QWidget):
         if run is not self._run:
             self._tell("")
         self._run = run
-        self.setVisible(run is not None and run.result is not None)
+        has_result = run is not None and run.result is not None
+        self.setVisible(has_result)
         for button in (self.button, self.figure_button):
-            button.setEnabled(self._writing is None)
+            button.setEnabled(has_result and self._writing is None)
 
     def _ask_and_write(
         self, what: str, write: "Callable[[KeptRun, str | Path], Path]", ending: str, kinds: str

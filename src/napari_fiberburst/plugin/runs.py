@@ -135,9 +135,9 @@ class RunsPanel(QWidget):
         undo.setContentsMargins(0, 0, 0, 0)
         self._undo.setLayout(undo)
         layout.addWidget(self._undo)
+        layout.addWidget(self.save)
         layout.addWidget(self.compare)
         layout.addLayout(row_of(self.continue_button, self._more_steps, self.remove_button))
-        layout.addWidget(self.save)
 
     def _connect(self) -> None:
         self.table.chosen.connect(self._take_choice)

@@ -1,7 +1,7 @@
 """Temporary images, alone in a viewer; what was shown before comes back."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from napari.components import ViewerModel
 from napari.layers import Image, Layer
@@ -23,10 +23,15 @@ class Stage:
         Whose layers.
     when_disturbed : callable
         Called when somebody else adds a layer meanwhile, or takes one away.
+    make_way : callable
+        Clears it; called when another one is set up in the same viewer.
     """
 
-    def __init__(self, viewer: ViewerModel, when_disturbed: Callable[[], None]) -> None:
-        self._viewer, self._when_disturbed = viewer, when_disturbed
+    # Those that are set, of all viewers. One that is set up over another would take what that has hidden for hidden.
+    _set: ClassVar[list["Stage"]] = []
+
+    def __init__(self, viewer: ViewerModel, when_disturbed: Callable[[], None], make_way: Callable[[], None]) -> None:
+        self._viewer, self._when_disturbed, self._make_way = viewer, when_disturbed, make_way
         self._before: dict[Layer, bool] | None = None
         self._grid: dict[str, object] = {}
         self._shown: list[Layer] = []
@@ -37,7 +42,10 @@ class Stage:
         return self._before is not None
 
     def set_up(self) -> None:
-        """Hide what is shown."""
+        """Hide what is shown; another stage in this viewer is cleared first."""
+        for other in [stage for stage in Stage._set if stage._viewer is self._viewer]:
+            other._make_way()
+        Stage._set.append(self)
         self._before = {layer: layer.visible for layer in self._viewer.layers}
         for layer in self._viewer.layers:
             layer.visible = False
@@ -102,6 +110,8 @@ class Stage:
 
     def abandon(self) -> None:
         """Leave the viewer as it is, because its window is gone."""
+        if self in Stage._set:
+            Stage._set.remove(self)
         for event in self._events:
             event.disconnect(self._take_change)
 
