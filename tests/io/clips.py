@@ -62,6 +62,7 @@ CLIPS = {
     "h264": ("a.mp4", "libx264", "yuv420p", {"options": {"bf": "3", "g": "24"}}),
     "one long group": ("a.mp4", "libx264", "yuv420p", {"options": {"bf": "3", "g": "999", "sc_threshold": "0"}}),
     "open groups": ("a.mp4", "libx264", "yuv420p", {"options": {"bf": "3", "g": "12", "x264-params": "open-gop=1"}}),
+    "renewed in parts": ("a.ts", "libx264", "yuv420p", {"options": {"x264-params": "intra-refresh=1:keyint=20"}}),
     "h264 in avi, times wrong": ("a.avi", "libx264", "yuv420p", {"options": {"bf": "3", "g": "16"}}),
     "bare h264, without times": ("a.h264", "libx264", "yuv420p", {"options": {"bf": "3", "g": "16"}}),
     "transport stream": ("a.ts", "libx264", "yuv420p", {"options": {"bf": "3", "g": "16"}}),

@@ -52,8 +52,8 @@ def read_burst(
         numbers = chosen_frames(frames, unread.shape[0], unread.name)
         if frames is None and unread.is_video and len(numbers) > _MOST_UNASKED:
             raise BurstError(
-                f"{path} has {len(numbers)} frames, which is a recording rather than a burst; choose some 20 of them, "
-                f'such as frames="0:20"; fiberburst info {path} offers some that suit'
+                f"{path} has {len(numbers)} frames, which is a recording rather than a burst; choose some 20 of them "
+                f'by frames="0:20" (--frames 0:20); fiberburst info {path} offers some that suit'
             )
         pixels = unread.reader(numbers)
         known = dict(unread.metadata)

@@ -20,8 +20,8 @@ logger = logging.getLogger(__name__)
 
 # The end of a file is decoded to see whether it is whole, where its last group has at most so many frames.
 _LONGEST_GROUP = 2000
-# Whether colours are seen is told by so many frames.
-_SAMPLED = 16
+# Whether colours are seen is told by so many frames, any of those of a file that has no more than so many.
+_SAMPLED, _SHORT = 16, 4000
 # A video is grey where its channels differ by no more than this part of full scale: chroma off by 2 of 255 from
 # neutral, as rounding leaves it, makes them differ by 4.
 _NEUTRAL = 4 / 255
@@ -83,7 +83,8 @@ class _Frames:
 def read_video(path: Path) -> Recording:
     """Open a video. Its frames are decoded when the pixels are sliced.
 
-    Grey formats, and colours that are neutral in 16 frames spread over the file, make grey frames. Grey values have the
+    Grey formats, and colours that are neutral in 16 frames spread over the file (of a long file, key frames), make grey
+    frames. Grey values have the
     depth that they are recorded in, up to 16 bits; colours have 8, or 16 where they are deeper. Luma of the narrow
     range of television is stretched to full scale.
 
@@ -136,7 +137,7 @@ def _seen_in(index: VideoIndex, handle: Handle[Decoder]) -> _Pixels:
         return _Pixels.of(av, index.pixels, is_grey=True)
     colours = _Pixels.of(av, index.pixels, is_grey=False)
     most = _NEUTRAL * np.iinfo(colours.dtype).max
-    for number in _cheap(index):
+    for number in _sample(index):
         with handle.use() as decoder:
             pixels = colours.array(decoder.frame(number))
         if np.ptp(pixels, axis=2).max() > most:
@@ -144,10 +145,9 @@ def _seen_in(index: VideoIndex, handle: Handle[Decoder]) -> _Pixels:
     return _Pixels.of(av, index.pixels, is_grey=True)
 
 
-def _cheap(index: VideoIndex) -> list[int]:
-    """Return the numbers of some frames that are decoded quickly: key frames, or the first ones where these are few."""
+def _sample(index: VideoIndex) -> list[int]:
+    """Return the numbers of some frames, spread over the file: key frames where there are many."""
     keys = np.sort(index.numbers[index.keys])
-    keys = keys[keys >= 0]
-    if len(keys) >= _SAMPLED:
-        keys = keys[np.linspace(0, len(keys) - 1, _SAMPLED).round().astype(int)]
-    return sorted({*keys.tolist(), *range(min(_SAMPLED - min(len(keys), _SAMPLED), len(index.order)))})
+    among = keys[keys >= 0] if len(keys) >= _SAMPLED or len(index.order) > _SHORT else np.arange(len(index.order))
+    places = np.linspace(0, len(among) - 1, min(_SAMPLED, len(among))).round().astype(int)
+    return [int(number) for number in among[places]]

@@ -15,6 +15,8 @@ logger = logging.getLogger(__name__)
 _NEAR = 16
 # From so many key frames before it a frame is tried to be decoded, and from the first one.
 _TRIES = 3
+# FFmpeg's kinds of frames that are made from others, P and B.
+_FROM_OTHERS = (2, 3)
 # Where the file is entered, the key frame is looked for in so many packets more than there should be before it.
 _MORE = 50
 
@@ -66,21 +68,23 @@ class Decoder:
     def _begin(self, key: int) -> None:
         self._frames = decode(self._stream, self._usable(self._enter(key)))
         self._start = key
+        # Some key frames are none: where the container is wrong, or codecs renew frames in parts, one after the other.
+        self._is_sure = key == self._index.keys[0]
         self._first = max(0, int(self._index.numbers[key]))
         self._next = self._first
 
     def _go_on_to(self, number: int) -> Any:
         """Return a frame, or None where it does not come."""
         for packet, frame in self._frames:
-            if packet == self._start and not frame.key_frame:  # the container is wrong: decoding cannot begin here
-                return None
+            if packet == self._start:
+                self._is_sure |= frame.key_frame and int(frame.pict_type) not in _FROM_OTHERS
             current = int(self._index.numbers[packet])
             self._next = max(self._next, current + 1)
-            if current == number:
+            if current == number and self._is_sure:
                 if frame.is_corrupt:
                     logger.warning("frame %d of %s is damaged", number, self._index.path)
                 return frame
-            if current > number:
+            if current >= number:
                 return None
         return None
 
