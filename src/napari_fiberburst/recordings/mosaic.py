@@ -8,7 +8,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -62,6 +62,8 @@ class Mosaic:
         Pixels, the finest period on which two halves of the frames agree; None where that is not known.
     notes : tuple of str
         What a user should know.
+    quality : str
+        "good", or "doubtful" where the notes say why the picture may be wrong.
     """
 
     paths: tuple[Path, ...]
@@ -69,6 +71,7 @@ class Mosaic:
     track: Track
     resolution: float | None
     notes: tuple[str, ...]
+    quality: Literal["good", "doubtful"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,7 +150,9 @@ def mosaicking(
     write_poses(poses, track, located.work.source)
     shutil.rmtree(folder)
     resolution = None if told.agreement is None else told.agreement.resolution
-    return Mosaic(paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes)
+    return Mosaic(
+        paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes, quality=located.quality
+    )
 
 
 def check_mosaic(output: str | Path) -> Path:
