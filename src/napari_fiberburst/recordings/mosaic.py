@@ -136,8 +136,9 @@ def mosaicking(
     track = located.track
     if not track.pieces:
         raise BurstError(
-            f"no two frames of {source.name} show the same place; a mosaic needs frames that overlap by an eighth at "
-            "least, with something to see in them"
+            f"no two frames of {source.name} show the same place, or nothing moves in it; a mosaic needs frames of an "
+            "object that moves, which overlap by an eighth at least; a few frames of one place are a burst: fiberburst "
+            "reconstruct --frames"
         )
     told = told_by(located.traces, track, 0)
     further = (target.with_name(f"{stem}-{piece + 1}{ENDING}") for piece in range(1, track.pieces))
