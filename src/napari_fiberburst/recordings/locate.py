@@ -18,7 +18,15 @@ from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.recordings.links import Links
 from napari_fiberburst.recordings.poses import Poses, solve_poses
-from napari_fiberburst.recordings.refine import Refinement, bending, larger_model, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.refine import (
+    Refinement,
+    ask_to_bend,
+    bending,
+    larger_model,
+    refine_unit,
+    refine_units,
+    refined,
+)
 from napari_fiberburst.recordings.register import registering
 from napari_fiberburst.recordings.traces import Traces, tracing
 from napari_fiberburst.recordings.track import Track
@@ -132,7 +140,7 @@ def _refining(
             track, settled = _with_freedom(work, track, links, asked), 0
         elif number + 1 < _ROUNDS or settled < _SETTLED or track.error < _WORTH * before.error:
             continue
-        elif is_free and track.dof > _TURNING and unbent is None:
+        elif is_free and unbent is None and ask_to_bend(parts):
             unbent, track, settled = track, bending(track), 0
         else:
             break

@@ -4,6 +4,7 @@ Pairs of frames leave a tenth of a pixel; the scene knows each place from many f
 against it leaves some hundredths. Scene and frames are found in turn.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -39,6 +40,9 @@ _LEAST_LIGHT, _MOST_GAIN = 0.05, 5.0
 _MODELS = (2, 4, 6)
 # A larger model is asked for where it explains the median frame better than noise would by this ratio.
 _ASKED = 4.0
+# One frame in so many is asked whether it bends; where the median one of these would keep more than this part of what
+# the scene misses, frames do not.
+_ASKED_OF, _LEFT_BY_BENDING = 8, 0.97
 # Frames that are less like the scene than this do not belong to it.
 _LEAST_ALIKE = 0.3
 
@@ -64,6 +68,9 @@ class Refinement(Stored):
     asked : numpy.ndarray
         (n, 2) by how much turning and growing, and stretching beside them, would explain each frame better, for each
         unknown, in mean squares of what the scene misses: what noise alone makes of it is about 1.
+    bending : numpy.ndarray
+        (n,) what part of its root mean square a first bend would leave of what the scene misses of a frame; NaN where
+        that was not asked.
     agreement, power : Tensor
         (N, C), sums over the frames of what each core shows times what the scene shows, and of the latter's square.
     """
@@ -77,6 +84,7 @@ class Refinement(Stored):
     missed: NDArray[np.float64]
     alike: NDArray[np.float64]
     asked: NDArray[np.float64]
+    bending: NDArray[np.float64]
     agreement: Tensor
     power: Tensor
 
@@ -110,6 +118,7 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
         missed=np.concatenate([part.missed for part in found] or [np.zeros(0)]),
         alike=np.concatenate([part.alike for part in found] or [np.zeros(0)]),
         asked=np.concatenate([part.asked for part in found] or [np.zeros((0, 2))]),
+        bending=np.concatenate([part.bending for part in found] or [np.zeros(0)]),
         agreement=sum((part.agreement for part in found), none),
         power=sum((part.power for part in found), none),
     )
@@ -126,10 +135,14 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
     slopes = along_x, along_y
     exposures, matrices, asked, left = _stepped(track, frames, points, robust, residual, light, slopes)
-    control = None
+    bend = _Bend(basis(track.shape, traces.template.positions), track.shape, robust, left, slopes, typical)
+    control, told = None, np.full(len(frames), np.nan)
     if track.control is not None:
-        shown = basis(track.shape, traces.template.positions)
-        control = _bent(torch.from_numpy(track.control[frames]), shown, track.shape, robust, left, slopes, typical)
+        control = torch.from_numpy(track.control[frames])
+        control = control + torch.stack([bend.step(number, one)[0] for number, one in enumerate(control)])
+    elif track.dof == _MODELS[-1]:
+        for number in np.flatnonzero(frames % _ASKED_OF == 0).tolist():
+            told[number] = bend.step(number, None)[1]
     agreement, power = _light(samples, sampling, robust, filtered)
     return Refinement(
         frames=frames,
@@ -139,6 +152,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
         missed=typical.double().numpy(),
         alike=_correlation(samples.grey, light, weights).double().numpy(),
         asked=asked / typical.double().numpy()[:, None] ** 2,
+        bending=told,
         agreement=agreement,
         power=power,
     )
@@ -193,25 +207,46 @@ def _stepped(
     return exposures, change @ track.scene_from_frame[frames], asked.double().numpy(), left
 
 
-def _bent(
-    control: Tensor,
-    shown: Tensor,
-    shape: tuple[int, int],
-    weights: Tensor,
-    residual: Tensor,
-    slopes: tuple[Tensor, Tensor],
-    typical: Tensor,
-) -> Tensor:
-    """Return how frames bend (n, 2, M) after one step of Gauss-Newton each, held back by elasticity."""
-    found = []
-    for number, one in enumerate(control):
-        jacobian = torch.cat([shown * slope[number][:, None] for slope in slopes], dim=1)
-        weighted = jacobian * weights[number][:, None]
-        prior = torch.kron(torch.eye(2), elastic(shape, float(typical[number]) ** 2))
-        rhs = weighted.T @ residual[number] - prior @ one.reshape(-1)
-        step = torch.linalg.solve(weighted.T @ jacobian + prior, rhs)
-        found.append(one + step.clamp(-_MOST_SHIFT, _MOST_SHIFT).reshape(one.shape))
-    return torch.stack(found)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bend:
+    """What frames ask for beyond planes: a step of Gauss-Newton each, held back by elasticity.
+
+    Attributes
+    ----------
+    shown : Tensor
+        (N, M), what each control point does at the samples.
+    shape : (int, int)
+        Height and width of a frame.
+    weights, residual : Tensor
+        (n, N).
+    slopes : tuple of Tensor
+        (n, N) along x and y.
+    typical : Tensor
+        (n,) root mean square of the residuals.
+    """
+
+    shown: Tensor
+    shape: tuple[int, int]
+    weights: Tensor
+    residual: Tensor
+    slopes: tuple[Tensor, Tensor]
+    typical: Tensor
+
+    def step(self, number: int, control: Tensor | None) -> tuple[Tensor, float]:
+        """Return a frame's step (2, M), and what part of the residuals' root mean square it leaves.
+
+        From where its control points are (2, M), or from none.
+        """
+        weights, residual = self.weights[number], self.residual[number]
+        jacobian = torch.cat([self.shown * slope[number][:, None] for slope in self.slopes], dim=1)
+        weighted = jacobian * weights[:, None]
+        prior = torch.kron(torch.eye(2), elastic(self.shape, float(self.typical[number]) ** 2))
+        rhs = weighted.T @ residual
+        pulled = rhs if control is None else rhs - prior @ control.reshape(-1)
+        step = torch.linalg.solve(weighted.T @ jacobian + prior, pulled)
+        square = float((weights * residual.square()).sum())
+        left = math.sqrt(max(0.0, 1 - float(step @ rhs) / square)) if square > 0 else 1.0
+        return step.clamp(-_MOST_SHIFT, _MOST_SHIFT).reshape(2, -1), left
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:
@@ -258,6 +293,12 @@ def bending(track: Track) -> Track:
     """Return the track of frames that may bend, and do not yet."""
     rows, columns = control_grid(track.shape).shape
     return replace(track, control=np.zeros((len(track), 2, rows * columns), np.float32))
+
+
+def ask_to_bend(parts: list[Refinement]) -> bool:
+    """Whether frames may bend: those that were asked would be explained better."""
+    told = np.concatenate([part.bending for part in parts] or [np.zeros(0)])
+    return bool(np.isfinite(told).any()) and float(np.nanmedian(told)) < _LEFT_BY_BENDING
 
 
 def larger_model(track: Track, parts: list[Refinement]) -> int:
