@@ -4,7 +4,6 @@ Pairs of frames leave a tenth of a pixel; the scene knows each place from many f
 against it leaves some hundredths. Scene and frames are found in turn.
 """
 
-import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.grid import Grid, Sampling
-from napari_fiberburst.recordings.bending import basis, control_grid, elastic
+from napari_fiberburst.recordings.bending import Bend, basis, control_grid
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
 from napari_fiberburst.recordings.tiles import pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
@@ -135,7 +134,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
     slopes = along_x, along_y
     exposures, matrices, asked, left = _stepped(track, frames, points, robust, residual, light, slopes)
-    bend = _Bend(basis(track.shape, traces.template.positions), track.shape, robust, left, slopes, typical)
+    bend = Bend(basis(track.shape, traces.template.positions), track.shape, robust, left, slopes, typical)
     control, told = None, np.full(len(frames), np.nan)
     if track.control is not None:
         control = torch.from_numpy(track.control[frames])
@@ -205,48 +204,6 @@ def _stepped(
     taken = torch.from_numpy(step).to(residual)
     left = residual - (taken[:, None] @ jacobian)[:, 0]
     return exposures, change @ track.scene_from_frame[frames], asked.double().numpy(), left
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Bend:
-    """What frames ask for beyond planes: a step of Gauss-Newton each, held back by elasticity.
-
-    Attributes
-    ----------
-    shown : Tensor
-        (N, M), what each control point does at the samples.
-    shape : (int, int)
-        Height and width of a frame.
-    weights, residual : Tensor
-        (n, N).
-    slopes : tuple of Tensor
-        (n, N) along x and y.
-    typical : Tensor
-        (n,) root mean square of the residuals.
-    """
-
-    shown: Tensor
-    shape: tuple[int, int]
-    weights: Tensor
-    residual: Tensor
-    slopes: tuple[Tensor, Tensor]
-    typical: Tensor
-
-    def step(self, number: int, control: Tensor | None) -> tuple[Tensor, float]:
-        """Return a frame's step (2, M), and what part of the residuals' root mean square it leaves.
-
-        From where its control points are (2, M), or from none.
-        """
-        weights, residual = self.weights[number], self.residual[number]
-        jacobian = torch.cat([self.shown * slope[number][:, None] for slope in self.slopes], dim=1)
-        weighted = jacobian * weights[:, None]
-        prior = torch.kron(torch.eye(2), elastic(self.shape, float(self.typical[number]) ** 2))
-        rhs = weighted.T @ residual
-        pulled = rhs if control is None else rhs - prior @ control.reshape(-1)
-        step = torch.linalg.solve(weighted.T @ jacobian + prior, pulled)
-        square = float((weights * residual.square()).sum())
-        left = math.sqrt(max(0.0, 1 - float(step @ rhs) / square)) if square > 0 else 1.0
-        return step.clamp(-_MOST_SHIFT, _MOST_SHIFT).reshape(2, -1), left
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:

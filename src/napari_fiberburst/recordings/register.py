@@ -114,6 +114,7 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
         for unit in units:
             links = links + Links.load(work.path(stage, unit))
         poses = solve_poses(links, len(traces), dof)
+    _linker.cache_clear()  # images and spectra: some 150 MB that are not needed any more
     return links
 
 
