@@ -3,7 +3,7 @@
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from napari_fiberburst.recordings.views import middle_of
 from napari_fiberburst.recordings.work import Doing, Work, complete
 from napari_fiberburst.scene.shading import find_shading
 from napari_fiberburst.steps import drain
+from napari_fiberburst.stored import Stored
 
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
@@ -78,8 +79,8 @@ def locating(
         Where to work; by default in this process.
     """
     yield Doing("calibrating the bundle", left=1)
-    found, notes = bundle_of(source, bundle)
-    work = Work(source=source, bundle=found, folder=folder)
+    bundle, notes = _kept_bundle(source, bundle, folder / "bundle.safetensors")
+    work = Work(source=source, bundle=bundle, folder=folder)
     traces = yield from tracing(work, client)
     poses = yield from registering(work, dof, client)
     track = _first_track(work, traces, poses)
@@ -94,6 +95,24 @@ def locating(
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
     return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found(Stored):
+    """A bundle as it was found, so that work that goes on does so with the same one."""
+
+    _kind: ClassVar[str] = "bundle in a recording"
+
+    bundle: Bundle
+    notes: tuple[str, ...]
+
+
+def _kept_bundle(source: FrameSource, given: Bundle | None, path: Path) -> tuple[Bundle, tuple[str, ...]]:
+    if not path.exists():
+        bundle, notes = bundle_of(source, given)
+        _Found(bundle=bundle, notes=notes).save(path)
+    found = _Found.load(path)
+    return found.bundle, found.notes
 
 
 def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:
