@@ -23,3 +23,11 @@ class DeviceError(FiberBurstError):
 
 class OutputError(FiberBurstError):
     """A result cannot be written where it was asked to go, or a saved one cannot be read."""
+
+
+class ClusterError(FiberBurstError):
+    """Workers cannot be had as they were asked for, or were lost."""
+
+
+class FullDiskError(OutputError):
+    """There is no room for what was to be written."""

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from napari_fiberburst.cli.progress import followed
+from napari_fiberburst.cli.work import add_work, clear, worked
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.io import open_recording
 
@@ -19,14 +19,15 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "mosaic",
         help="make one wide picture of a long recording",
-        description="Find where every frame of a recording lies, and make one wide picture of all of them.",
+        description="Find where every frame of a recording lies, and make one wide picture of all of them. A run that "
+        "was cut short goes on where it is given again.",
     )
     add_recording(parser, "OUT.ome.zarr; the places of all frames go into OUT.poses.csv beside it")
     parser.set_defaults(run=run)
 
 
 def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
-    """Add what all commands on long recordings have: what to read, where to write, and what is known of it."""
+    """Add what all commands on long recordings have: what to read, where to write, what is known, and where to work."""
     parser.add_argument(
         "input", type=Path, nargs="+", help="a video, TIFF, folder or OME-Zarr; several are one recording"
     )
@@ -38,13 +39,15 @@ def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
         default="auto",
         help="how frames may lie: shifted, or turned and grown as well; default, as they ask for",
     )
+    add_work(parser)
 
 
 def opened(options: argparse.Namespace) -> tuple[FrameSource, "Bundle | None"]:
     """Return the recording that options name, and its bundle where that is given."""
     from napari_fiberburst.pipeline.reconstruct import as_bundle
 
-    source = open_recording(options.input[0] if len(options.input) == 1 else options.input)
+    paths = [path.resolve() for path in options.input]  # workers may have another current folder
+    source = open_recording(paths[0] if len(paths) == 1 else paths)
     print(source)
     return source, None if options.bundle is None else as_bundle(options.bundle)
 
@@ -54,13 +57,18 @@ def run(options: argparse.Namespace) -> int:
     # torch takes seconds to load
     from napari_fiberburst.recordings.mosaic import check_target, mosaicking
 
+    clear(options)
     check_target(options.output, "mosaic")
     source, bundle = opened(options)
-    found = followed(mosaicking(source, options.output, bundle=bundle, dof=MOTIONS[options.motion], client=None))
+    found = worked(
+        options,
+        source.shape,
+        lambda client: mosaicking(source, options.output, bundle=bundle, dof=MOTIONS[options.motion], client=client),
+    )
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
     if found.resolution is not None:
         print(f"two halves of the frames agree down to periods of {found.resolution:.1f} pixels")
     reasons = f": {'; '.join(found.notes)}" if found.notes else ""
     print(f"the mosaic is {found.quality}{reasons}")
-    print(f"wrote {', '.join(map(str, found.paths))} and {found.poses}")
+    print(f"wrote {' and '.join(map(str, (*found.paths, found.poses)))}")
     return 0

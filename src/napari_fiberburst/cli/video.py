@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from napari_fiberburst.cli.mosaic import MOTIONS, add_recording, opened
-from napari_fiberburst.cli.progress import followed
+from napari_fiberburst.cli.work import clear, worked
 from napari_fiberburst.errors import SettingsError
 
 
@@ -51,11 +51,14 @@ def run(options: argparse.Namespace) -> int:
     from napari_fiberburst.recordings.mosaic import check_target
     from napari_fiberburst.recordings.video import videoing
 
+    clear(options)
     check_target(options.output, "video")
     regions = None if options.regions is None else _regions(options.regions)
     source, bundle = opened(options)
-    found = followed(
-        videoing(
+    found = worked(
+        options,
+        source.shape,
+        lambda client: videoing(
             source,
             options.output,
             bundle=bundle,
@@ -65,8 +68,8 @@ def run(options: argparse.Namespace) -> int:
             regions=regions,
             mp4=options.mp4,
             scale_bar=options.scale_bar,
-            client=None,
-        )
+            client=client,
+        ),
     )
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, each from {found.window}")
     for note in found.notes:

@@ -3,7 +3,7 @@
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from napari_fiberburst.recordings.views import middle_of
 from napari_fiberburst.recordings.work import Doing, Work, complete
 from napari_fiberburst.scene.shading import find_shading
 from napari_fiberburst.steps import drain
+from napari_fiberburst.stored import Stored
 
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
@@ -100,8 +101,8 @@ def locating(
         Where to work; by default in this process.
     """
     yield Doing("calibrating the bundle", left=1)
-    found, notes = bundle_of(source, bundle)
-    work = Work(source=source, bundle=found, folder=folder)
+    bundle, notes = _kept_bundle(source, bundle, folder / "bundle.safetensors")
+    work = Work(source=source, bundle=bundle, folder=folder)
     traces = yield from tracing(work, client)
     links = yield from registering(work, dof, client)
     track = _first_track(work, traces, solve_poses(links, len(traces), dof))
@@ -149,6 +150,24 @@ def _refining(
     # The weight of a frame falls with the square of what the scene misses of it.
     belongs = track.weights > 1 / _MOST_MISSED**2
     return replace(track, piece=np.where(belongs, track.piece, -1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found(Stored):
+    """A bundle as it was found, so that work that goes on does so with the same one."""
+
+    _kind: ClassVar[str] = "bundle in a recording"
+
+    bundle: Bundle
+    notes: tuple[str, ...]
+
+
+def _kept_bundle(source: FrameSource, given: Bundle | None, path: Path) -> tuple[Bundle, tuple[str, ...]]:
+    if not path.exists():
+        bundle, notes = bundle_of(source, given)
+        _Found(bundle=bundle, notes=notes).save(path)
+    found = _Found.load(path)
+    return found.bundle, found.notes
 
 
 def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:

@@ -3,7 +3,6 @@
 import csv
 import io
 import math
-import shutil
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -29,7 +28,7 @@ from napari_fiberburst.recordings.scene import equations, told_by
 from napari_fiberburst.recordings.tiles import Tile, picture_of, pieces_tiled
 from napari_fiberburst.recordings.traces import traced
 from napari_fiberburst.recordings.track import Track
-from napari_fiberburst.recordings.work import Doing, Work, claim, complete
+from napari_fiberburst.recordings.work import Doing, Work, claim, complete, finish, is_begun, own, room
 from napari_fiberburst.scene.spline import NormalEquations
 from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
@@ -131,9 +130,16 @@ def mosaicking(
 ) -> Generator[Doing, None, Mosaic]:
     """Make a mosaic as `mosaic` does; yields how far that is."""
     target = check_target(output, "mosaic")
-    stem = target.name[: -len(ENDING)]
-    folder = target.with_name(stem + ".work")
+    folder = work_of(target)
     claim(folder, identity(source, bundle=bundle, task="mosaic", dof=dof))
+    with room(folder):
+        own(folder, [target, poses_of(target)])
+        return (yield from _made(source, target, folder, bundle=bundle, dof=dof, client=client))
+
+
+def _made(
+    source: FrameSource, target: Path, folder: Path, *, bundle: Bundle | None, dof: int | None, client: Any | None
+) -> Generator[Doing, None, Mosaic]:
     located = yield from locating(source, folder, bundle=bundle, dof=dof, client=client)
     track = located.track
     if not track.pieces:
@@ -143,15 +149,15 @@ def mosaicking(
             "reconstruct --frames"
         )
     told = told_by(located.traces, track, 0)
-    further = (target.with_name(f"{stem}-{piece + 1}{ENDING}") for piece in range(1, track.pieces))
-    paths = (target, *further)
+    paths = tuple(_piece_of(target, piece) for piece in range(track.pieces))
+    own(folder, paths)
     yield from _draw(located, paths, told.smoothness, client)
     for path in paths:
         for part in (path, *(path / name for name in _FURTHER)):
             coarsen(part)
-    poses = target.with_name(stem + ".poses.csv")
+    poses = poses_of(target)
     write_poses(poses, track, located.work.source, {piece: picture_of(track, piece) for piece in range(track.pieces)})
-    shutil.rmtree(folder)
+    finish(folder)
     resolution = None if told.agreement is None else told.agreement.resolution
     return Mosaic(
         paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes, quality=located.quality
@@ -166,14 +172,46 @@ def check_target(output: str | Path, what: str) -> Path:
     OutputError
         It has another ending, is there already, or its folder cannot be written.
     """
-    target = Path(output)
+    target = Path(output).resolve()  # workers may have another current folder
     if not target.name.endswith(ENDING):
         raise OutputError(f"a {what} is written to a folder ending in {ENDING}; got {output}")
-    folder = target.with_name(target.name[: -len(ENDING)] + ".work")
-    if target.exists() and not folder.exists():
-        raise OutputError(f"{target} is there already; choose another name, or remove it")
-    check_place(folder.with_suffix(".poses.csv"))
+    poses = poses_of(target)
+    for path in (target, poses):
+        if path.exists() and not is_begun(work_of(target)):
+            raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
+    check_place(poses)
     return target
+
+
+def work_of(output: Path) -> Path:
+    """Return the folder of the work on an output."""
+    return output.with_name(output.name.removesuffix(ENDING) + ".work")
+
+
+def outputs_of(output: Path) -> list[Path]:
+    """Return what a finished mosaic or video has written: the table of places, by which pieces are known, and these."""
+    poses = poses_of(output)
+    if not poses.exists():
+        return [output]
+    with poses.open(newline="", encoding="utf-8") as table:
+        pieces = {int(row["piece"]) for row in csv.DictReader(table) if row["piece"]}
+    return [_piece_of(output, piece) for piece in sorted({0, *pieces})] + [poses, *traces_of(output)]
+
+
+def poses_of(output: Path) -> Path:
+    """Return the table of places beside an output."""
+    return output.with_name(output.name.removesuffix(ENDING) + ".poses.csv")
+
+
+def traces_of(output: Path) -> tuple[Path, Path]:
+    """Return the traces beside a video, of cores and of regions."""
+    zarr, table = (output.with_name(output.name.removesuffix(ENDING) + end) for end in (".traces.zarr", ".traces.csv"))
+    return zarr, table
+
+
+def _piece_of(output: Path, piece: int) -> Path:
+    stem = output.name.removesuffix(ENDING)
+    return output if piece == 0 else output.with_name(f"{stem}-{piece + 1}{ENDING}")
 
 
 def identity(source: FrameSource, *, bundle: Bundle | None, **settings: Any) -> dict[str, Any]:

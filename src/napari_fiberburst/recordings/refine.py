@@ -24,7 +24,7 @@ from napari_fiberburst.scene.smoothness import UNTOLD
 from napari_fiberburst.stored import Stored
 
 # Side of the tiles on which frames are compared with the scene, nodes: all of most mosaics.
-_SIDE = 1024
+TILE_SIDE = 1024
 # Iterations of conjugate gradients, at most: the scene has to be good enough to compare frames with.
 _ITERATIONS = 32
 # Residuals beyond so many of their root mean square count less.
@@ -91,7 +91,7 @@ class Refinement(Stored):
 def refine_unit(work: Work, stage: str, number: int) -> None:
     """Compare the frames of one tile with the scene that they and those about them make."""
     track, traces = Track.load(work.shared(stage)), traced(work)
-    piece, tile = pieces_tiled(track, _SIDE, halo=max(track.shape))[number]
+    piece, tile = pieces_tiled(track, TILE_SIDE, halo=max(track.shape))[number]
     around = equations(traces, track, track.touching(tile.grid, piece), tile.grid)
     scene = around.solve(UNTOLD, iterations=_ITERATIONS)
     refine(traces, track, tile.of_frames(track, piece), tile.grid, around.through(scene)).save(work.path(stage, number))
@@ -99,7 +99,7 @@ def refine_unit(work: Work, stage: str, number: int) -> None:
 
 def refine_units(track: Track) -> range:
     """Return the numbers of all units of `refine_unit`."""
-    return range(len(pieces_tiled(track, _SIDE, halo=max(track.shape))))
+    return range(len(pieces_tiled(track, TILE_SIDE, halo=max(track.shape))))
 
 
 def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, filtered: Tensor) -> Refinement:

@@ -21,7 +21,7 @@ TRACES = "traces"
 # Frames to a part, which is what one unit of work makes and what is read from the disk at once.
 PART = 64
 # So many parts are kept in memory.
-_KEPT = 32
+KEPT_PARTS = 32
 # Frames that vary less than this part of the median frame are black, white or empty in another way.
 _LEAST_CONTRAST_OF_USUAL = 0.2
 # A frame with more than this part of its pixels over-exposed is white.
@@ -135,7 +135,7 @@ class Traces:
         """Return the traces of a recording whose parts can be had, such as from files."""
         template = sample_cores(torch.zeros(1, *source.shape[1:]), bundle, source.acquisition)
         template = replace(template, values=template.values[:0], weights=template.weights[:0])
-        return cls(template=template, summary=summary, part=lru_cache(maxsize=_KEPT)(part))
+        return cls(template=template, summary=summary, part=lru_cache(maxsize=KEPT_PARTS)(part))
 
     def __len__(self) -> int:
         return len(self.summary.contrast)

@@ -1,6 +1,5 @@
 """Every frame of a recording, reconstructed from those about it in time."""
 
-import shutil
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
@@ -16,7 +15,15 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io.pyramid import create_pyramid
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
-from napari_fiberburst.recordings.mosaic import ENDING, OME_UNITS, check_target, identity, write_poses
+from napari_fiberburst.recordings.mosaic import (
+    ENDING,
+    OME_UNITS,
+    check_target,
+    identity,
+    poses_of,
+    work_of,
+    write_poses,
+)
 from napari_fiberburst.recordings.movie import check_movie, write_movie
 from napari_fiberburst.recordings.regions import check_regions, create_traces, numbers_of, write_table
 from napari_fiberburst.recordings.smoothness import smoothness_for
@@ -24,7 +31,7 @@ from napari_fiberburst.recordings.stretch import STRETCH, Plan, solve_unit
 from napari_fiberburst.recordings.tiles import picture_of
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.window import window_for
-from napari_fiberburst.recordings.work import Doing, claim, complete
+from napari_fiberburst.recordings.work import Doing, claim, complete, finish, own, room
 from napari_fiberburst.steps import drain
 
 # A stabilised video shows the whole picture where that has at most so many times the pixels of a frame.
@@ -159,9 +166,9 @@ def videoing(
         raise SettingsError(f"window must be a number of frames, at least 1; got {window!r}")
     if regions is not None and not stabilised:
         check_regions(regions, source.shape[1:3], "a frame")
-    stem = target.name[: -len(ENDING)]
-    folder, poses, traces, table = (
-        target.with_name(stem + ending) for ending in (".work", ".poses.csv", ".traces.zarr", ".traces.csv")
+    folder, poses = work_of(target), poses_of(target)
+    traces, table = (
+        target.with_name(target.name.removesuffix(ENDING) + end) for end in (".traces.zarr", ".traces.csv")
     )
     claim(
         folder,
@@ -175,33 +182,35 @@ def videoing(
             regions=None if regions is None else sha256(np.ascontiguousarray(regions).tobytes()).hexdigest(),
         ),
     )
-    located = yield from locating(source, folder, bundle=bundle, dof=dof, client=client)
-    plan = _planned(located, target, traces, window, stabilised, regions)
-    located.work.begin("frames")
-    if not located.work.shared("frames").exists():  # frames that are solved already stay
-        _create(plan, located)
-        plan.save(located.work.shared("frames"))
-    units = range(-(-len(source) // STRETCH))
-    for _, left in complete(solve_unit, "frames", located.work, units, client):
-        yield Doing("solving the frames", left=left, units=len(units))
-    write_poses(poses, plan.track, source, _pictures(plan))
-    if regions is not None:
-        write_table(table, traces, source.acquisition.times, source.acquisition.channel_names)
-    movie = None
-    if mp4 is not None:
-        yield Doing("writing the film", left=1)
-        movie = write_movie(target, Path(mp4), source.acquisition, scale_bar=scale_bar)
-    shutil.rmtree(folder)
-    return Video(
-        path=target,
-        poses=poses,
-        traces=traces,
-        table=None if regions is None else table,
-        movie=movie,
-        track=plan.track,
-        window=plan.window,
-        notes=(*located.notes, *_remarks(plan)),
-    )
+    with room(folder):
+        own(folder, [target, poses, traces, table])
+        located = yield from locating(source, folder, bundle=bundle, dof=dof, client=client)
+        plan = _planned(located, target, traces, window, stabilised, regions)
+        located.work.begin("frames")
+        if not located.work.shared("frames").exists():  # frames that are solved already stay
+            _create(plan, located)
+            plan.save(located.work.shared("frames"))
+        units = range(-(-len(source) // STRETCH))
+        for _, left in complete(solve_unit, "frames", located.work, units, client):
+            yield Doing("solving the frames", left=left, units=len(units))
+        write_poses(poses, plan.track, source, _pictures(plan))
+        if regions is not None:
+            write_table(table, traces, source.acquisition.times, source.acquisition.channel_names)
+        movie = None
+        if mp4 is not None:
+            yield Doing("writing the film", left=1)
+            movie = write_movie(target, Path(mp4), source.acquisition, scale_bar=scale_bar)
+        finish(folder)
+        return Video(
+            path=target,
+            poses=poses,
+            traces=traces,
+            table=None if regions is None else table,
+            movie=movie,
+            track=plan.track,
+            window=plan.window,
+            notes=(*located.notes, *_remarks(plan)),
+        )
 
 
 def _planned(

@@ -4,18 +4,33 @@ A unit that is done leaves a marker. Work that was cut short goes on with the un
 same bits as work that was not, because no unit depends on the order in which others are done.
 """
 
+import errno
 import json
-from collections.abc import Callable, Iterator, Sequence
+import pickle
+import shutil
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
-from napari_fiberburst.errors import OutputError
+from napari_fiberburst.errors import ClusterError, FiberBurstError, FullDiskError, OutputError
 from napari_fiberburst.io.results import write_whole
 
-_IDENTITY = "work.json"
+# In the folder of work: what it is, and what it has begun to write outside.
+_IDENTITY, _OUTPUTS = "work.json", "outputs.json"
+# A unit that fails by something else than what a user can mend, such as a file server that did not answer, is tried
+# again so many times.
+_RETRIES = 2
+# As many digits of a key tell one from another.
+_DIGITS = 12
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,8 +64,15 @@ class Work:
         (self.folder / stage).mkdir(parents=True, exist_ok=True)
 
     def marker(self, stage: str, number: int) -> Path:
-        """Return the file whose presence says that a unit is done."""
-        return self.folder / stage / f"{number:06d}.done"
+        """Return the file whose presence says that a unit is done, for this recording, bundle and settings."""
+        return self.folder / stage / f"{number:06d}-{_key(self)}.done"
+
+
+@lru_cache(maxsize=4)
+def _key(work: Work) -> str:
+    known = work.folder / _IDENTITY
+    identity = known.read_bytes() if known.exists() else b""
+    return sha256(identity + f"{work.source.fingerprint}{work.bundle.digest()}".encode()).hexdigest()[:_DIGITS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,29 +124,115 @@ def complete(
         Where to do them; by default in this process, one after the other.
     """
     left = [number for number in numbers if not work.marker(stage, number).exists()]
-    if client is None:
-        for done, number in enumerate(left, start=1):
-            _do(unit, stage, work, number)
-            yield number, len(left) - done
-        return
-    from distributed import as_completed  # an extra
-
-    shared = client.scatter(work, broadcast=True)
-    keys = [f"{stage}-{number}-{work.folder.name}" for number in left]
-    futures = client.map(_do_for, [(unit, stage, number) for number in left], work=shared, key=keys, retries=3)
-    for done, future in enumerate(as_completed(futures), start=1):  # type: ignore[no-untyped-call]
-        yield future.result(), len(left) - done
+    outcomes = _here(unit, stage, work, left) if client is None else _there(unit, stage, work, left, client)
+    with closing(outcomes):
+        for count, (number, error) in enumerate(outcomes, start=1):
+            if error is not None:
+                raise error
+            yield number, len(left) - count
 
 
-def _do(unit: Unit, stage: str, work: Work, number: int) -> int:
-    unit(work, stage, number)
-    work.marker(stage, number).touch()
-    return number
+# The number of a unit, and what a user has to mend before it can be done.
+Outcome = tuple[int, FiberBurstError | None]
 
 
-def _do_for(asked: tuple[Unit, str, int], work: Work) -> int:
-    unit, stage, number = asked
-    return _do(unit, stage, work, number)
+def _here(unit: Unit, stage: str, work: Work, numbers: Sequence[int]) -> Generator[Outcome, None, None]:
+    for number in numbers:
+        yield _do(unit, stage, work, number)
+
+
+def _there(unit: Unit, stage: str, work: Work, numbers: Sequence[int], client: Any) -> Generator[Outcome, None, None]:
+    from distributed import CancelledError, KilledWorker, as_completed  # an extra
+
+    # No key is used again: a result that the scheduler still knows would be taken for that of other work.
+    futures = client.map(
+        _do_on_worker,
+        numbers,
+        unit=unit,
+        stage=stage,
+        handed=_handed(work),
+        key=stage,
+        pure=False,
+        retries=_RETRIES,
+    )
+    try:
+        for future in as_completed(futures):  # type: ignore[no-untyped-call]
+            yield future.result()
+    except KilledWorker as error:
+        raise ClusterError(
+            f"workers were lost again and again over one unit of {stage}, most likely because their memory was too "
+            "little; take fewer workers with more memory each, and give the same command again to go on"
+        ) from error
+    except CancelledError as error:
+        raise ClusterError(
+            f"the scheduler was lost during {stage}; start it again, and give the same command again to go on"
+        ) from error
+    finally:
+        client.cancel([future for future in futures if not future.done()])
+
+
+def _do(unit: Unit, stage: str, work: Work, number: int) -> Outcome:
+    """Do one unit that is not done yet, whoever asks: a worker's loss takes what it knew of units that it had done."""
+    marker = work.marker(stage, number)
+    try:
+        if not marker.exists():
+            with room(work.folder):
+                unit(work, stage, number)
+                marker.touch()
+    except FiberBurstError as error:
+        return number, type(error)(f"{error} ({stage}, unit {number})")
+    return number, None
+
+
+def _do_on_worker(number: int, unit: Unit, stage: str, handed: str) -> Outcome:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # there are as many workers as cores
+    try:
+        return _do(unit, stage, _taken(handed), number)
+    finally:
+        torch.set_num_threads(threads)
+
+
+@lru_cache(maxsize=2)
+def _handed(work: Work) -> str:
+    """Return a file that workers take the work from, each of them once.
+
+    In a file, because what was scattered is gone when the worker that holds it is.
+    """
+    told = pickle.dumps(work)
+    path = work.folder / f"handed-{sha256(told).hexdigest()[:_DIGITS]}.pickle"
+    with write_whole(path) as stream:
+        stream.write(told)
+    return str(path)
+
+
+@lru_cache(maxsize=2)
+def _taken(path: str) -> Work:
+    """Return the work that was handed over: one object for all units, so that what they know by it is known once."""
+    work: Work = pickle.loads(Path(path).read_bytes())
+    return work
+
+
+@contextmanager
+def room(folder: Path) -> Iterator[None]:
+    """Say what to do where the disk is full.
+
+    Raises
+    ------
+    FullDiskError
+        It is.
+    """
+    try:
+        yield
+    except FullDiskError:
+        raise
+    except (OSError, OutputError) as error:
+        cause = error.__cause__ if isinstance(error, OutputError) else error
+        if not isinstance(cause, OSError) or cause.errno not in _FULL:
+            raise
+        raise FullDiskError(
+            f"the disk of {folder} is full; make room, and give the same command again: what is done stays"
+        ) from error
 
 
 def claim(folder: Path, identity: dict[str, Any]) -> bool:
@@ -142,19 +250,71 @@ def claim(folder: Path, identity: dict[str, Any]) -> bool:
     OutputError
         Other work has been begun there; the message names what differs.
     """
-    file = folder / _IDENTITY
-    if file.exists():
-        known = json.loads(file.read_text(encoding="utf-8"))
+    if is_begun(folder):
+        known = json.loads((folder / _IDENTITY).read_text(encoding="utf-8"))
         names = sorted(set(known) | set(identity))
         other = [name for name in names if known.get(name) != identity.get(name)]
         if other:
             differences = "; ".join(f"{name} was {known.get(name)!r}, is {identity.get(name)!r}" for name in other)
             raise OutputError(
                 f"{folder} holds work that was begun otherwise ({differences}); go on with the same settings and "
-                "recording, or remove that folder to begin anew"
+                "recording, begin anew (--fresh), or choose another output"
             )
         return True
     folder.mkdir(parents=True, exist_ok=True)
-    with write_whole(file) as stream:
-        stream.write(json.dumps(identity, indent=2).encode())
+    _write_json(folder / _IDENTITY, identity)
     return False
+
+
+def is_begun(folder: Path) -> bool:
+    """Whether work was begun in a folder and is not finished."""
+    return (folder / _IDENTITY).exists()
+
+
+def own(folder: Path, paths: Sequence[Path]) -> None:
+    """Let work write to paths, none of which may be there, unless this work has made it.
+
+    Raises
+    ------
+    OutputError
+        Something of others is there.
+    """
+    known = _owned(folder)
+    for path in paths:
+        if path not in known and path.exists():
+            raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
+    _write_json(folder / _OUTPUTS, [str(path) for path in dict.fromkeys([*known, *paths])])
+
+
+def discard(folder: Path) -> None:
+    """Remove work that was begun, and what it had begun to write."""
+    for path in _owned(folder):
+        remove(path)
+    finish(folder)
+
+
+def finish(folder: Path) -> None:
+    """Remove the folder of work that is done, at once for whoever looks for it."""
+    if folder.exists():
+        gone = folder.with_name(f".{folder.name}.gone")
+        remove(gone)
+        folder.rename(gone)
+        remove(gone)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _owned(folder: Path) -> list[Path]:
+    file = folder / _OUTPUTS
+    return [Path(path) for path in json.loads(file.read_text(encoding="utf-8"))] if file.exists() else []
+
+
+def _write_json(path: Path, value: Any) -> None:
+    with write_whole(path) as stream:
+        stream.write(json.dumps(value, indent=2).encode())

@@ -1,0 +1,66 @@
+"""``fiberburst batch``: every recording of a folder, with one report."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from napari_fiberburst.cli.progress import followed
+from napari_fiberburst.cli.work import add_workers, goes_on
+from napari_fiberburst.errors import OutputError
+from napari_fiberburst.report.batch import write_batch
+from napari_fiberburst.results.batch import Row, write_table
+
+TASKS = ("mosaic", "burst")
+
+
+def add_to(commands: Any) -> None:
+    """Add the command to the parser."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        "batch",
+        help="do the same with every recording of a folder",
+        description="Make a mosaic, or one image of a good burst, of every recording of a folder, and a report of all: "
+        "report.html and table.csv. A batch that was cut short goes on where it is given again.",
+    )
+    parser.add_argument("folder", type=Path, help="with videos, TIFF stacks, OME-Zarr or folders of frames in it")
+    parser.add_argument("--task", choices=TASKS, required=True, help="what to make of each recording")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="a folder, made where it is not there")
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE.toml", help="with a table of settings for each task, such as [mosaic]"
+    )
+    add_workers(parser)
+    parser.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Do the task with every recording, and say what has come of it. Returns 1 where one has failed."""
+    # torch takes seconds to load
+    from napari_fiberburst.recordings.batch import batching, read_settings, recordings_in
+    from napari_fiberburst.recordings.cluster import workers
+
+    settings = read_settings(options.settings, options.task)
+    folder, output = options.folder.resolve(), options.output.resolve()
+    recordings_in(folder, output)
+    _make(output)
+
+    def report(rows: Sequence[Row]) -> None:
+        write_batch(output / "report.html", rows, f"{options.folder.resolve().name}: {options.task}")
+        write_table(output / "table.csv", rows)
+
+    with goes_on(), workers(options.workers, options.scheduler) as client:
+        rows = followed(batching(folder, output, options.task, settings=settings, client=client, on_rows=report))
+    failed = [row for row in rows if row.verdict == "failed"]
+    for row in failed:
+        print(f"{row.name} failed: {'; '.join(row.notes)}")
+    print(f"{len(rows) - len(failed)} of {len(rows)} recordings are done; wrote {output / 'report.html'} and table.csv")
+    return 1 if failed else 0
+
+
+def _make(output: Path) -> None:
+    try:
+        output.mkdir(exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder {output} cannot be made ({error}); choose another place") from error
+    others = [path.name for path in output.iterdir()]
+    if others and not (output / "work.json").exists():
+        raise OutputError(f"{output} holds something else, such as {others[0]}; choose a folder that is new or empty")

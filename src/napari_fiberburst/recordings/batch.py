@@ -1,0 +1,270 @@
+"""Every recording of a folder, one after the other, with the same settings."""
+
+import time
+import tomllib
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from PIL import Image
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.errors import BurstError, ClusterError, FullDiskError, SettingsError
+from napari_fiberburst.io import open_recording
+from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
+from napari_fiberburst.io.folder import IMAGE_ENDINGS, natural_key
+from napari_fiberburst.io.picture import as_picture, encode_png
+from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.io.tiff import TIFF_ENDINGS
+from napari_fiberburst.io.video_container import VIDEO_ENDINGS
+from napari_fiberburst.io.zarr import is_zarr
+from napari_fiberburst.pipeline.choose import best_burst
+from napari_fiberburst.pipeline.reconstruct import as_bundle, reconstruct
+from napari_fiberburst.recordings.mosaic import identity, mosaicking
+from napari_fiberburst.recordings.work import Doing, claim, room
+from napari_fiberburst.results.batch import Row
+from napari_fiberburst.settings import choose
+
+_ENDINGS = (*TIFF_ENDINGS, *VIDEO_ENDINGS, *ARCHIVE_ENDINGS)
+# Longer side of a thumbnail, pixels.
+_THUMBNAIL = 192
+# A mosaic of more than this part of the frames that show something is good; of less than that, bad.
+_MOST_PLACED, _LEAST_PLACED = 0.9, 0.5
+_MOTIONS = {"auto": None, "translation": 2, "similarity": 4}
+# What one recording alone can fail by; others go on.
+_FAILURES = (ValueError, OSError, RuntimeError, LookupError, ArithmeticError, MemoryError)
+
+Settings = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Made:
+    """What a task has made of a recording."""
+
+    outputs: tuple[Path, ...]
+    verdict: str
+    notes: tuple[str, ...]
+    facts: tuple[str, ...]
+    picture: NDArray[np.floating]
+
+
+def _mosaic(
+    source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
+) -> Generator[Doing, None, Made]:
+    dof = _MOTIONS[settings.get("motion", "auto")]
+    made = yield from mosaicking(source, folder / "mosaic.ome.zarr", bundle=bundle, dof=dof, client=client)
+    placed, count = int((made.track.piece == 0).sum()), len(made.track)
+    part = placed / count
+    verdict = "good" if part >= _MOST_PLACED else "doubtful" if part >= _LEAST_PLACED else "bad"
+    group = zarr.open_group(made.paths[0], mode="r")
+    coarsest = np.asarray(group[str(sum(1 for _ in group.array_keys()) - 1)])
+    facts = [f"{placed} of {count} frames in the picture"]
+    if made.resolution is not None:
+        facts.append(f"resolves periods of {made.resolution:.1f} px")
+    return Made(
+        outputs=(*made.paths, made.poses),
+        verdict=verdict,
+        notes=made.notes,
+        facts=tuple(facts),
+        picture=np.moveaxis(coarsest, 0, -1) if coarsest.ndim == 3 else coarsest,
+    )
+
+
+def _burst(
+    source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
+) -> Generator[Doing, None, Made]:
+    choices = dict(settings)
+    chosen = best_burst(source, choices.pop("frames", 20))
+    yield Doing("reconstructing", left=1)
+    result = reconstruct(source.burst(chosen), bundle=bundle, **choices)
+    path = result.save(folder / "image.ome.tif")
+    return Made(
+        outputs=(path,),
+        verdict=result.quality or "not judged",
+        notes=tuple(result.notes),
+        facts=(f"frames {chosen.start} to {chosen.stop - 1} of {len(source)}",),
+        picture=result.image,
+    )
+
+
+def _check_mosaic(settings: Settings) -> None:
+    for name in settings:
+        if name != "motion":
+            raise SettingsError(f"{name} is no setting of a mosaic; known ones are bundle and motion")
+    if settings.get("motion", "auto") not in _MOTIONS:
+        raise SettingsError(f"motion must be one of {', '.join(_MOTIONS)}; got {settings['motion']!r}")
+
+
+def _check_burst(settings: Settings) -> None:
+    frames = settings.get("frames", 20)
+    if not isinstance(frames, int) or frames < 2:
+        raise SettingsError(f"frames must be a number of frames, at least 2; got {frames!r}")
+    choose(**{name: value for name, value in settings.items() if name != "frames"})
+
+
+# What can be done with every recording: what does it, and what refuses settings beforehand.
+TASKS: dict[str, tuple[Callable[..., Generator[Doing, None, Made]], Callable[[Settings], None]]] = {
+    "mosaic": (_mosaic, _check_mosaic),
+    "burst": (_burst, _check_burst),
+}
+_OPENING = ("axes", "black_level", "white_level")
+
+
+def read_settings(path: Path | None, task: str) -> dict[str, dict[str, Any]]:
+    """Read a settings file.
+
+    Parameters
+    ----------
+    path : Path or None
+        A TOML file with a table for each task, such as ``[mosaic]``, and ``[recording]`` for how recordings are opened.
+        A ``bundle`` is a path, relative to the file.
+    task : str
+        Whose table is checked.
+
+    Returns
+    -------
+    dict
+        The tables "recording" and of the task, empty where the file has none.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read, or a name or value in it is unknown.
+    """
+    try:
+        tables = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{path} cannot be read as TOML ({error}); mend it, or take another file") from error
+    known = ("recording", *TASKS)
+    for name, table in tables.items():
+        if name not in known or not isinstance(table, dict):
+            tables_known = ", ".join(f"[{name}]" for name in known)
+            raise SettingsError(f"{name} in {path} is no table that is known; expected {tables_known}")
+    opening, own = dict(tables.get("recording", {})), dict(tables.get(task, {}))
+    for name in opening:
+        if name not in _OPENING:
+            raise SettingsError(f"{name} is not of how recordings are opened; expected {', '.join(_OPENING)}")
+    TASKS[task][1]({name: value for name, value in own.items() if name != "bundle"})
+    if path is not None and "bundle" in own:
+        own["bundle"] = str((path.parent / own["bundle"]).resolve())
+    return {"recording": opening, task: own}
+
+
+def recordings_in(folder: Path, but: Path | None = None) -> list[Path]:
+    """Return the recordings of a folder, in natural order: videos, TIFF stacks, archives, OME-Zarr, folders of frames.
+
+    Raises
+    ------
+    BurstError
+        There is no such folder, or it has none.
+    """
+    if not folder.is_dir():
+        raise BurstError(f"there is no folder {folder}; expected one with recordings in it")
+    found = [path for path in folder.iterdir() if path != but and not path.name.startswith(".") and _is_recording(path)]
+    if not found:
+        raise BurstError(f"{folder} has no recordings; expected videos, TIFF stacks, OME-Zarr or folders of frames")
+    return sorted(found, key=natural_key)
+
+
+def _is_recording(path: Path) -> bool:
+    if path.is_dir():
+        return is_zarr(path) or any(file.suffix.lower() in IMAGE_ENDINGS for file in path.iterdir())
+    return path.name.lower().endswith(_ENDINGS)
+
+
+def batching(
+    folder: Path,
+    output: Path,
+    task: str,
+    *,
+    settings: Mapping[str, Settings],
+    client: Any | None,
+    on_rows: Callable[[Sequence[Row]], object],
+) -> Generator[Doing, None, tuple[Row, ...]]:
+    """Do a task with every recording of a folder; yields what is being done.
+
+    A recording that fails has a row that says why, and is tried again when the batch is.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the recordings.
+    output : Path
+        A folder; each recording has one in it that is called as its file. Done there already is not done again.
+    task : str
+        One of `TASKS`.
+    settings : mapping
+        As `read_settings` gives them.
+    client : distributed.Client, optional
+        Where units of work are done.
+    on_rows : callable
+        Is given all rows so far, whenever there is one more.
+
+    Raises
+    ------
+    BurstError
+        There are no recordings.
+    OutputError
+        Another batch was begun in the output, or the disk is full.
+    """
+    paths = recordings_in(folder, output)
+    claim(output, {"task": task, "settings": {name: dict(table) for name, table in settings.items()}})
+    own = dict(settings[task])
+    bundle = as_bundle(own.pop("bundle")) if "bundle" in own else None
+    rows: list[Row] = []
+    for number, path in enumerate(paths):
+        steps = _one(path, output / path.name, task, settings["recording"], own, bundle, client)
+        while True:
+            try:
+                doing = next(steps)
+            except StopIteration as end:
+                rows.append(end.value)
+                break
+            yield replace(doing, what=f"{path.name}: {doing.what}", step=number, steps=len(paths))
+        on_rows(rows)
+    return tuple(rows)
+
+
+def _one(
+    path: Path, place: Path, task: str, opening: Settings, own: Settings, bundle: Bundle | None, client: Any | None
+) -> Generator[Doing, None, Row]:
+    begun = time.monotonic()
+    yield Doing("opening", left=1)
+    try:
+        source = open_recording(path, **opening)
+        told = identity(source, bundle=bundle, task=task, **own)
+        kept = Row.load(place / "row.json", told)
+        if kept is not None:
+            return kept
+        with room(place.parent):
+            place.mkdir(exist_ok=True)
+            made = yield from TASKS[task][0](source, place, bundle, own, client)
+            row = _row(path.name, made, place, time.monotonic() - begun)
+            row.save(place / "row.json", told)
+    except (ClusterError, FullDiskError):
+        raise
+    except _FAILURES as error:
+        why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+        return Row(name=path.name, verdict="failed", notes=(why,), seconds=time.monotonic() - begun)
+    return row
+
+
+def _row(name: str, made: Made, place: Path, seconds: float) -> Row:
+    small = Image.fromarray(as_picture(made.picture))
+    small.thumbnail((_THUMBNAIL, _THUMBNAIL))
+    with write_whole(place / "thumbnail.png") as stream:
+        stream.write(encode_png(np.asarray(small)))
+    return Row(
+        name=name,
+        verdict=made.verdict,
+        notes=made.notes,
+        facts=made.facts,
+        seconds=seconds,
+        outputs=tuple(path.resolve().relative_to(place.parent).as_posix() for path in made.outputs),
+        thumbnail=f"{place.name}/thumbnail.png",
+    )

@@ -1,0 +1,146 @@
+"""A batch: a row for every recording, whether it fails or not."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import tifffile
+import zarr
+
+from napari_fiberburst.cli import main
+from napari_fiberburst.errors import BurstError, SettingsError
+from napari_fiberburst.io import open_recording
+from napari_fiberburst.recordings import batch
+from napari_fiberburst.recordings.batch import read_settings, recordings_in
+from napari_fiberburst.report.batch import write_batch
+from napari_fiberburst.results.batch import Row
+
+
+@pytest.fixture
+def folder(clip, tmp_path):
+    """Return a folder of two recordings that can be used, one that is broken, and what is none."""
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    (folder / "clip 10.mkv").write_bytes(clip.read_bytes())
+    frames = open_recording(clip).recorded(range(30))[..., 0]
+    tifffile.imwrite(folder / "clip 9.tif", frames, photometric="minisblack")
+    (folder / "broken.avi").write_bytes(b"nothing")
+    (folder / "notes.txt").write_text("none")
+    return folder
+
+
+def table_of(output):
+    with (output / "table.csv").open(newline="") as table:
+        return list(csv.DictReader(table))
+
+
+def test_recordings_are_found_in_natural_order(folder):
+    (folder / "frames").mkdir()
+    (folder / "frames" / "1.png").touch()
+    names = [path.name for path in recordings_in(folder)]
+    assert names == ["broken.avi", "clip 9.tif", "clip 10.mkv", "frames"]
+    assert "frames" not in [path.name for path in recordings_in(folder, folder / "frames")]
+    with pytest.raises(BurstError, match="has no recordings"):
+        recordings_in(folder / "frames")
+    with pytest.raises(BurstError, match="there is no folder"):
+        recordings_in(folder / "nowhere")
+
+
+def test_one_that_fails_does_not_stop_the_others_and_is_tried_again(folder, tmp_path, capsys, monkeypatch):
+    output = tmp_path / "out"
+    words = ["batch", str(folder), "--task", "mosaic", "-o", str(output)]
+    assert main(words) == 1
+    assert "2 of 3 recordings are done" in capsys.readouterr().out
+    rows = table_of(output)
+    assert [(row["recording"], row["verdict"]) for row in rows] == [
+        ("broken.avi", "failed"),
+        ("clip 9.tif", "good"),
+        ("clip 10.mkv", "good"),
+    ]
+    assert "broken.avi" in rows[0]["notes"]
+    assert rows[1]["facts"].startswith("30 of 30 frames in the picture")
+    picture = zarr.open_array(output / "clip 9.tif" / "mosaic.ome.zarr" / "0", mode="r")
+    assert np.isfinite(np.asarray(picture)).mean() > 0.5
+    page = (output / "report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 2
+    assert 'href="clip%209.tif/mosaic.ome.zarr"' in page
+
+    opened = []
+
+    def only_opened(source, *more, **settings):
+        opened.append(source.name)
+        raise BurstError("not asked for")
+
+    (folder / "broken.avi").unlink()
+    monkeypatch.setattr(batch, "mosaicking", only_opened)
+    assert main(words) == 0
+    assert not opened
+    assert [row["verdict"] for row in table_of(output)] == ["good", "good"]
+
+
+def test_a_batch_of_bursts_has_an_image_of_each(folder, tmp_path):
+    (folder / "broken.avi").unlink()
+    (folder / "clip 10.mkv").unlink()
+    settings = tmp_path / "batch.toml"
+    settings.write_text("[burst]\nframes = 8\nmotion = 'translation'\n[mosaic]\nmotion = 'similarity'\n")
+    output = tmp_path / "out"
+    words = ["batch", str(folder), "--task", "burst", "-o", str(output), "--settings", str(settings)]
+    assert main(words) == 0
+    image = tifffile.imread(output / "clip 9.tif" / "image.ome.tif")
+    assert image.ndim == 2
+    told = json.loads((output / "clip 9.tif" / "image.json").read_text())
+    assert told["settings"]["method"]["motion"]["name"] == "translation"
+    (row,) = table_of(output)
+    assert row["verdict"] in {"good", "doubtful", "bad"}
+    assert row["outputs"] == "clip 9.tif/image.ome.tif"
+
+
+def test_settings_are_checked_before_anything_is_opened(tmp_path):
+    file = tmp_path / "batch.toml"
+    for text, said in (
+        ("[mosaic", "cannot be read as TOML"),
+        ("[movie]", r"movie .* is no table that is known; expected \[recording\], \[mosaic\], \[burst\]"),
+        ("[mosaic]\nspeed = 1", "speed is no setting of a mosaic"),
+        ("[mosaic]\nmotion = 'wild'", "motion must be one of auto, translation, similarity"),
+        ("[recording]\nlevels = 1", "expected axes, black_level, white_level"),
+    ):
+        file.write_text(text)
+        with pytest.raises(SettingsError, match=said):
+            read_settings(file, "mosaic")
+    file.write_text("[burst]\nsmoothnes = 1")
+    with pytest.raises(SettingsError, match="smoothnes"):
+        read_settings(file, "burst")
+    file.write_text("[mosaic]\nbundle = 'probe.bundle'")
+    assert read_settings(file, "mosaic")["mosaic"]["bundle"] == str(tmp_path / "probe.bundle")
+
+
+def test_another_batch_and_other_files_are_left_alone(folder, tmp_path, capsys):
+    output = tmp_path / "out"
+    output.mkdir()
+    (output / "mine.txt").touch()
+    words = ["batch", str(folder), "--task", "mosaic", "-o", str(output)]
+    assert main(words) == 2
+    assert "holds something else, such as mine.txt" in capsys.readouterr().err
+    (output / "work.json").write_text(json.dumps({"task": "burst", "settings": {}}))
+    assert main(words) == 2
+    assert "task was 'burst', is 'mosaic'" in capsys.readouterr().err
+
+
+def test_a_full_disk_stops_the_batch(folder, tmp_path, capsys, monkeypatch):
+    def full(*given, **settings):
+        raise OSError(28, "No space left on device")
+        yield
+
+    monkeypatch.setattr(batch, "mosaicking", full)
+    (folder / "broken.avi").unlink()
+    assert main(["batch", str(folder), "--task", "mosaic", "-o", str(tmp_path / "out")]) == 2
+    assert "is full; make room" in capsys.readouterr().err
+
+
+def test_names_are_text_in_the_page(tmp_path):
+    write_batch(tmp_path / "report.html", [Row(name="<b>.avi", verdict="failed", notes=("a < b",))], "clips & more")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "&lt;b&gt;.avi" in page
+    assert "a &lt; b" in page
+    assert "<title>clips &amp; more</title>" in page
