@@ -19,6 +19,7 @@ from qtpy.QtGui import QHelpEvent
 from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 
 from napari_fiberburst.plugin.contributions import PLUGIN
+from napari_fiberburst.plugin.tasks.long import LongTask
 
 if TYPE_CHECKING:
     import napari
@@ -50,14 +51,19 @@ class Command:
     act: Callable[[Any], None] = QAbstractButton.click
 
 
+def _going(dock: Any) -> Any:
+    """Return the task whose run is meant: the one that is shown, or else that which makes pictures."""
+    return dock.task if isinstance(dock.task, LongTask) else dock.picture
+
+
 COMMANDS = {
     "start": Command(
         title="Start the task that is shown", key="Ctrl-Enter", widget=lambda dock: dock.task.start_button
     ),
     "pause": Command(
-        title="Pause the run, or continue it", key="Ctrl-Shift-H", widget=lambda dock: dock.picture.pause_button
+        title="Pause the run, or continue it", key="Ctrl-Shift-H", widget=lambda dock: _going(dock).pause_button
     ),
-    "stop": Command(title="Stop the run and keep it", key="Ctrl-Shift-E", widget=lambda dock: dock.picture.stop_button),
+    "stop": Command(title="Stop the run and keep it", key="Ctrl-Shift-E", widget=lambda dock: _going(dock).stop_button),
     "compare": Command(
         title="Compare two images", key="Ctrl-Shift-B", widget=lambda dock: dock.picture.runs.compare.button
     ),
@@ -93,6 +99,9 @@ class KeyHints(QObject):
     def __init__(self, dock: "FiberBurstWidget") -> None:
         super().__init__(dock)
         self._names: dict[QObject, list[str]] = {task.start_button: ["start"] for task in dock.tasks}
+        for task in dock.tasks:
+            if isinstance(task, LongTask):
+                self._names |= {task.pause_button: ["pause"], task.stop_button: ["stop"]}
         for name, command in COMMANDS.items():
             names = self._names.setdefault(command.widget(dock), [])
             names.extend({name}.difference(names))
