@@ -3,7 +3,7 @@
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,7 +18,15 @@ from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.recordings.links import Links
 from napari_fiberburst.recordings.poses import Poses, solve_poses
-from napari_fiberburst.recordings.refine import Refinement, larger_model, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.refine import (
+    Refinement,
+    ask_to_bend,
+    bending,
+    larger_model,
+    refine_unit,
+    refine_units,
+    refined,
+)
 from napari_fiberburst.recordings.register import registering
 from napari_fiberburst.recordings.traces import Traces, tracing
 from napari_fiberburst.recordings.track import Track
@@ -30,7 +38,13 @@ from napari_fiberburst.steps import drain
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
 # Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it.
-_ROUNDS, _MOST_ROUNDS, _WORTH = 3, 8, 0.97
+_ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
+# Frames bend where that lowers the error by a part of it.
+_WORTH_BENDING = 0.9
+# Frames of which the scene misses so many times the usual show something else, or are blurred.
+_MOST_MISSED = 3.0
+# Places are doubtful where more than this part of the frames has none, or the median frame is less like the scene.
+_MOST_LOST, _LEAST_ALIKE = 0.25, 0.93
 # Gains and exposures have settled after so many rounds.
 _SETTLED = 2
 # Degrees of freedom of links: frames of fewer are placed anew where they turn.
@@ -56,12 +70,15 @@ class Located:
         Where the frames lie.
     notes : tuple of str
         What a user should know.
+    quality : str
+        "good", or "doubtful" where the notes say why the places of frames may be wrong.
     """
 
     work: Work
     traces: Traces
     track: Track
     notes: tuple[str, ...]
+    quality: Literal["good", "doubtful"]
 
 
 def locating(
@@ -88,7 +105,25 @@ def locating(
     traces = yield from tracing(work, client)
     links = yield from registering(work, dof, client)
     track = _first_track(work, traces, solve_poses(links, len(traces), dof))
-    settled = 0
+    track = yield from _refining(work, traces, links, track, is_free=dof is None, client=client)
+    doubts = _doubts(traces, track)
+    return Located(
+        work=work,
+        traces=traces,
+        track=track,
+        notes=(*notes, *_remarks(traces, track), *doubts),
+        quality="doubtful" if doubts else "good",
+    )
+
+
+def _refining(
+    work: Work, traces: Traces, links: Links, track: Track, *, is_free: bool, client: Any | None
+) -> Generator[Doing, None, Track]:
+    """Refine a track until that lowers its error no more; `is_free`, with as much freedom as the frames ask for.
+
+    Frames may bend where that is worth it: it is tried where they ask for stretches.
+    """
+    settled, unbent = 0, None
     for number in range(_MOST_ROUNDS):
         stage, before = f"refined-{number}", track
         work.begin(stage)
@@ -100,12 +135,20 @@ def locating(
         track, settled = refined(track, parts), settled + 1
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
-        asked = larger_model(track, parts) if dof is None and settled >= _SETTLED else track.dof
+        asked = larger_model(track, parts) if is_free and settled >= _SETTLED else track.dof
         if asked > track.dof:
             track, settled = _with_freedom(work, track, links, asked), 0
-        elif number + 1 >= _ROUNDS and track.error > _WORTH * before.error:
+        elif number + 1 < _ROUNDS or settled < _SETTLED or track.error < _WORTH * before.error:
+            continue
+        elif is_free and unbent is None and ask_to_bend(parts):
+            unbent, track, settled = track, bending(track), 0
+        else:
             break
-    return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+    if unbent is not None and track.error > _WORTH_BENDING * unbent.error:
+        track = unbent
+    # The weight of a frame falls with the square of what the scene misses of it.
+    belongs = track.weights > 1 / _MOST_MISSED**2
+    return replace(track, piece=np.where(belongs, track.piece, -1))
 
 
 def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:
@@ -177,6 +220,21 @@ def _evened(traces: Traces, track: Track) -> Track:
     change = np.interp(np.arange(len(track)), frames, shading.exposures.numpy()).astype(np.float32)
     exposures = np.where(track.piece == 0, track.exposures * change, track.exposures)
     return replace(track, gains=gains, exposures=exposures)
+
+
+def _doubts(traces: Traces, track: Track) -> tuple[str, ...]:
+    """Return why the places of frames may be wrong."""
+    shows, placed = traces.summary.shows, track.piece >= 0
+    if not placed.any():
+        return ("no two frames show the same place",)
+    doubts = []
+    lost = float((shows & ~placed).sum() / max(1, shows.sum()))
+    if lost > _MOST_LOST:
+        doubts.append(f"{lost:.0%} of the frames that show something could not be placed")
+    alike = float(np.median(track.alike[placed]))
+    if alike < _LEAST_ALIKE:
+        doubts.append(f"frames are met by the scene with a correlation of {alike:.2f} alone; their places may be wrong")
+    return tuple(doubts)
 
 
 def _remarks(traces: Traces, track: Track) -> tuple[str, ...]:
