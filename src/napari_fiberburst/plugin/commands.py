@@ -20,6 +20,7 @@ from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 
 from napari_fiberburst.plugin.contributions import PLUGIN
 from napari_fiberburst.plugin.tasks.long import LongTask
+from napari_fiberburst.plugin.tasks.video import VideoTask
 
 if TYPE_CHECKING:
     import napari
@@ -71,6 +72,11 @@ COMMANDS = {
     "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
     "figure": Command(
         title="Save a figure", key=None, widget=lambda dock: dock.picture.display.card.report.figure_button
+    ),
+    "movie": Command(
+        title="Save the video as MP4",
+        key=None,
+        widget=lambda dock: next(task for task in dock.tasks if isinstance(task, VideoTask)).movie_button,
     ),
     "next_run": Command(
         title="Next run",
@@ -153,7 +159,7 @@ def press(name: str) -> None:
 
 start, pause, stop = partial(press, "start"), partial(press, "pause"), partial(press, "stop")
 compare, save = partial(press, "compare"), partial(press, "save")
-report, figure = partial(press, "report"), partial(press, "figure")
+report, figure, movie = partial(press, "report"), partial(press, "figure"), partial(press, "movie")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
 
 

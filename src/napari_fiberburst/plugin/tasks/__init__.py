@@ -4,5 +4,6 @@ from napari_fiberburst.plugin.tasks.bundle import BundleTask
 from napari_fiberburst.plugin.tasks.mosaic import MosaicTask
 from napari_fiberburst.plugin.tasks.picture import PictureTask
 from napari_fiberburst.plugin.tasks.task import Task
+from napari_fiberburst.plugin.tasks.video import VideoTask
 
-TASKS: tuple[type[Task], ...] = (PictureTask, MosaicTask, BundleTask)
+TASKS: tuple[type[Task], ...] = (PictureTask, VideoTask, MosaicTask, BundleTask)

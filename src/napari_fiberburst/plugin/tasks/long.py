@@ -57,6 +57,8 @@ class LongTask(Task):
         What else can be shown of the result.
     state : str
         "ready", "running", "paused" or "stopping".
+    told_of : (FrameSource, Placement, Path) or None
+        What was last begun on, where its frames lie in the viewer, and where it is written.
     """
 
     kind: ClassVar[str]
@@ -67,7 +69,7 @@ class LongTask(Task):
         super().__init__(viewer, source, parent)
         self.state: State = "ready"
         self._going: list[LongJob] = []  # none, or the one that is
-        self._told_of: tuple[FrameSource, Placement, Path] | None = None
+        self.told_of: tuple[FrameSource, Placement, Path] | None = None
         self._shown: dict[Path, PyramidLayer] = {}
         self._done: tuple[Path, ...] = ()
         self.output, self.motion = OutputRow(self.kind), QComboBox()
@@ -100,8 +102,12 @@ class LongTask(Task):
         return {"dof": self.motion.currentData()}
 
     def more_rows(self) -> dict[str, QWidget]:
-        """Return settings of this task alone, by their names."""
+        """Return new widgets of settings of this task alone, by their names."""
         return {}
+
+    def card_widgets(self) -> tuple[QWidget, ...]:
+        """Return new widgets of what can be done with a result; they are shown once there is one."""
+        return ()
 
     @property
     def job(self) -> LongJob | None:
@@ -126,7 +132,7 @@ class LongTask(Task):
             self._say_problem(str(error))
             return
         placement, _ = Placement.of(self.input.layers, burst.axes, (0, 0)), self._forget(path)
-        self._told_of = (source, placement, path)
+        self.told_of = (source, placement, path)
         opened_from = self.input.layers[0].metadata.get(METADATA_KEY, {}).get("recording_path")
         job = LongJob(partial(_begun, self.begin, source, opened_from, path, given, self.settings()))
         self._going.append(job)
@@ -183,9 +189,9 @@ class LongTask(Task):
 
     def _end(self, job: LongJob) -> None:
         atexit.unregister(job.control.stop)
-        if job is not self.job or self._told_of is None:
+        if job is not self.job or self.told_of is None:
             return  # the dock has been closed
-        path = self._told_of[2]
+        path = self.told_of[2]
         self._timer.stop()
         self._look()
         self._going.clear()
@@ -224,9 +230,9 @@ class LongTask(Task):
         """Show an image that lies on disk, or what has been added to it since."""
         from napari_fiberburst.plugin.pyramids import PyramidLayer  # needs zarr, an extra
 
-        if self._told_of is None:
+        if self.told_of is None:
             return
-        source, placement, _ = self._told_of
+        source, placement, _ = self.told_of
         known = self._shown.get(path)
         if known is not None:
             if known.layer in self._viewer.layers:
@@ -253,7 +259,7 @@ class LongTask(Task):
     def _forget(self, path: Path) -> None:
         """Let go of the layers of another output; they stay in the viewer."""
         self._done = ()
-        is_same = self._told_of is not None and self._told_of[2] == path
+        is_same = self.told_of is not None and self.told_of[2] == path
         self._shown = {
             one: shown for one, shown in self._shown.items() if is_same and shown.layer in self._viewer.layers
         }
@@ -303,7 +309,9 @@ class LongTask(Task):
             switch.blockSignals(True)
             switch.setChecked(any(one / name in self._shown for one in self._done))
             switch.blockSignals(False)
-            switch.setVisible(bool(self._done))
+        for widget in (*self.switches.values(), *self._of_result):
+            widget.setVisible(bool(self._done))
+            widget.setEnabled(bool(self._done))
         self.words.setVisible(bool(self.words.text()))
 
     def _connect(self) -> None:
@@ -348,6 +356,9 @@ class LongTask(Task):
         for widget in (self.bar, self.status, self.words):
             column.addWidget(widget)
         column.addLayout(switches)
+        self._of_result = self.card_widgets()
+        for widget in self._of_result:
+            column.addWidget(widget)
         self._show_card()
 
 
