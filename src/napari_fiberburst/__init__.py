@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from napari_fiberburst.pipeline.remeasure import flatten as flatten
     from napari_fiberburst.pipeline.remeasure import remeasure as remeasure
     from napari_fiberburst.pipeline.render import render as render
+    from napari_fiberburst.recordings.mosaic import mosaic as mosaic
+    from napari_fiberburst.recordings.video import video as video
     from napari_fiberburst.report import write_figure as write_figure
     from napari_fiberburst.report import write_report as write_report
     from napari_fiberburst.results.diagnostics import Diagnostics as Diagnostics
@@ -63,6 +65,7 @@ _HOMES = {
     "flatten": "pipeline.remeasure",
     "iterate": "pipeline.reconstruct",
     "load": "networks.image",
+    "mosaic": "recordings.mosaic",
     "open_recording": "io",
     "read_burst": "io",
     "reconstruct": "pipeline.reconstruct",
@@ -72,6 +75,7 @@ _HOMES = {
     "render": "pipeline.render",
     "sample": "bundle.samples",
     "solve": "scene.solve",
+    "video": "recordings.video",
     "write_figure": "report",
     "write_report": "report",
 }

@@ -2,11 +2,16 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-from tqdm import tqdm
-
+from napari_fiberburst.cli.progress import followed
+from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.io import open_recording
+
+if TYPE_CHECKING:
+    from napari_fiberburst.bundle.bundle import Bundle
+
+MOTIONS: Final = {"auto": None, "translation": 2, "similarity": 4}
 
 
 def add_to(commands: Any) -> None:
@@ -16,52 +21,42 @@ def add_to(commands: Any) -> None:
         help="make one wide picture of a long recording",
         description="Find where every frame of a recording lies, and make one wide picture of all of them.",
     )
+    add_recording(parser, "OUT.ome.zarr; the places of all frames go into OUT.poses.csv beside it")
+    parser.set_defaults(run=run)
+
+
+def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
+    """Add what all commands on long recordings have: what to read, where to write, and what is known of it."""
     parser.add_argument(
         "input", type=Path, nargs="+", help="a video, TIFF, folder or OME-Zarr; several are one recording"
     )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        help="OUT.ome.zarr; the places of all frames go into OUT.poses.csv beside it",
-    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help=output)
     parser.add_argument("--bundle", type=Path, help="probe.bundle, or an image of the bundle in even light")
     parser.add_argument(
         "--motion",
-        choices=("auto", "translation", "similarity"),
+        choices=tuple(MOTIONS),
         default="auto",
         help="how frames may lie: shifted, or turned and grown as well; default, as they ask for",
     )
-    parser.set_defaults(run=run)
+
+
+def opened(options: argparse.Namespace) -> tuple[FrameSource, "Bundle | None"]:
+    """Return the recording that options name, and its bundle where that is given."""
+    from napari_fiberburst.pipeline.reconstruct import as_bundle
+
+    source = open_recording(options.input[0] if len(options.input) == 1 else options.input)
+    print(source)
+    return source, None if options.bundle is None else as_bundle(options.bundle)
 
 
 def run(options: argparse.Namespace) -> int:
     """Make the mosaic and say what has come of it."""
     # torch takes seconds to load
-    from napari_fiberburst.pipeline.reconstruct import as_bundle
-    from napari_fiberburst.recordings.mosaic import check_mosaic, mosaicking
+    from napari_fiberburst.recordings.mosaic import check_target, mosaicking
 
-    check_mosaic(options.output)
-    source = open_recording(options.input[0] if len(options.input) == 1 else options.input)
-    print(source)
-    steps = mosaicking(
-        source,
-        options.output,
-        bundle=None if options.bundle is None else as_bundle(options.bundle),
-        dof={"auto": None, "translation": 2, "similarity": 4}[options.motion],
-        client=None,
-    )
-    with tqdm(total=1.0, bar_format="{desc}: {percentage:3.0f}%|{bar}| {elapsed}") as bar:
-        while True:
-            try:
-                doing = next(steps)
-            except StopIteration as end:
-                found = end.value
-                break
-            bar.set_description(doing.what)
-            bar.n = doing.part
-            bar.refresh()
+    check_target(options.output, "mosaic")
+    source, bundle = opened(options)
+    found = followed(mosaicking(source, options.output, bundle=bundle, dof=MOTIONS[options.motion], client=None))
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
     if found.resolution is not None:
         print(f"two halves of the frames agree down to periods of {found.resolution:.1f} pixels")

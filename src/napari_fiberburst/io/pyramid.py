@@ -1,4 +1,4 @@
-"""OME-Zarr 0.5 images that are written a tile at a time and opened at every zoom."""
+"""OME-Zarr 0.5 images and videos that are written a part at a time and opened at every zoom."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 # Pixels to a side of a chunk, and of the coarsest level at most.
 CHUNK = 256
+# Frames of a video to a chunk.
+CHUNK_FRAMES = 8
 
 
 def create_pyramid(
@@ -20,16 +22,18 @@ def create_pyramid(
     pixel_size: tuple[float, float] | None = None,
     unit: str | None = None,
     channels: tuple[str, ...] = (),
+    times: NDArray[np.float64] | None = None,
+    is_video: bool = False,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Make an image of float32 with nothing in it: NaN.
+    """Make an image or a video of float32 with nothing in it: NaN.
 
     Parameters
     ----------
     path : Path
         Of the image's group.
     shape : tuple of int
-        (H, W), or (C, H, W).
+        (H, W), or (C, H, W); of a video, T before it.
     name : str
         How the image is called.
     pixel_size : (float, float), optional
@@ -38,11 +42,16 @@ def create_pyramid(
         Of the pixel size, as OME-NGFF names it, such as "micrometer".
     channels : tuple of str
         Their names, where they have any.
+    times : numpy.ndarray, optional
+        (T,) seconds of the frames of a video. OME-NGFF knows even times alone: the scale is their median step.
+    is_video : bool
+        Whether the first axis is time.
     attributes : mapping, optional
         Of our own, beside what OME-NGFF asks for.
     """
     height, width = pixel_size or (1.0, 1.0)
-    lead = (1.0,) * (len(shape) - 2)
+    names = ("t",) * is_video + ("c",) * (len(shape) - 2 - is_video)
+    start, step = (0.0, 1.0) if times is None or len(times) < 2 else (float(times[0]), float(np.median(np.diff(times))))
     datasets = []
     group = zarr.open_group(path, mode="w", zarr_format=3)
     for level, size in enumerate(_levels(shape)):
@@ -50,26 +59,40 @@ def create_pyramid(
         group.create_array(
             str(level),
             shape=size,
-            chunks=(*(1,) * len(lead), CHUNK, CHUNK),
+            chunks=(*(CHUNK_FRAMES if axis == "t" else 1 for axis in names), CHUNK, CHUNK),
             dtype=np.float32,
             fill_value=np.nan,
-            dimension_names=("c", "y", "x")[-len(shape) :],
+            dimension_names=(*names, "y", "x"),
         )
         # A pixel of a coarser level lies in the middle of those that it stands for.
         middle = (factor - 1) / 2
+        scale = (step if axis == "t" else 1.0 for axis in names)
+        origin = (start if axis == "t" else 0.0 for axis in names)
         datasets.append(
             {
                 "path": str(level),
                 "coordinateTransformations": [
-                    {"type": "scale", "scale": [*lead, factor * height, factor * width]},
-                    {"type": "translation", "translation": [*(0.0 for _ in lead), middle * height, middle * width]},
+                    {"type": "scale", "scale": [*scale, factor * height, factor * width]},
+                    {"type": "translation", "translation": [*origin, middle * height, middle * width]},
                 ],
             }
         )
     space = {"type": "space"} | ({} if unit is None or pixel_size is None else {"unit": unit})
-    axes = [{"name": "c", "type": "channel"}] * len(lead) + [{"name": side, **space} for side in "yx"]
+    time = {"type": "time"} | ({} if times is None else {"unit": "second"})
+    kinds = {"t": time, "c": {"type": "channel"}, "y": space, "x": space}
+    axes = [{"name": axis, **kinds[axis]} for axis in (*names, "y", "x")]
     ome: dict[str, Any] = {"version": "0.5", "multiscales": [{"name": name, "axes": axes, "datasets": datasets}]}
     group.attrs.update({"ome": ome, **(attributes or {}), **({"channels": list(channels)} if channels else {})})
+
+
+def write_frames(path: Path, first: int, frames: NDArray[np.floating]) -> None:
+    """Write frames of a video, (n, [C,] H, W) from number `first` on, at every level; at whole chunks at once."""
+    group = zarr.open_group(path, mode="r+")
+    part = frames.astype(np.float32)
+    for level in range(sum(1 for _ in group.array_keys())):
+        if level > 0:
+            part = _halved(part)
+        zarr.open_array(path / str(level), mode="r+")[first : first + len(part)] = part
 
 
 def write_tile(path: Path, rows: tuple[int, int], columns: tuple[int, int], tile: NDArray[np.floating]) -> None:

@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import shutil
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +35,8 @@ from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
 
 ENDING = ".ome.zarr"
+# Units of length as OME-NGFF names them.
+OME_UNITS = {"µm": "micrometer", "nm": "nanometer", "mm": "millimeter"}
 # Nodes to a side of a tile, whole chunks; and nodes about it, in pitches: farther than that a scene does not reach.
 _SIDE, _HALO = 2 * CHUNK, 8.0
 # Iterations of a first scene, by which samples that show something else are told.
@@ -128,7 +130,7 @@ def mosaicking(
     source: FrameSource, output: str | Path, *, bundle: Bundle | None, dof: int | None, client: Any | None
 ) -> Generator[Doing, None, Mosaic]:
     """Make a mosaic as `mosaic` does; yields how far that is."""
-    target = check_mosaic(output)
+    target = check_target(output, "mosaic")
     stem = target.name[: -len(ENDING)]
     folder = target.with_name(stem + ".work")
     claim(folder, identity(source, bundle=bundle, task="mosaic", dof=dof))
@@ -148,7 +150,7 @@ def mosaicking(
         for part in (path, *(path / name for name in _FURTHER)):
             coarsen(part)
     poses = target.with_name(stem + ".poses.csv")
-    write_poses(poses, track, located.work.source)
+    write_poses(poses, track, located.work.source, {piece: picture_of(track, piece) for piece in range(track.pieces)})
     shutil.rmtree(folder)
     resolution = None if told.agreement is None else told.agreement.resolution
     return Mosaic(
@@ -156,8 +158,8 @@ def mosaicking(
     )
 
 
-def check_mosaic(output: str | Path) -> Path:
-    """Refuse a path that a mosaic cannot be written to, before long work rather than after it.
+def check_target(output: str | Path, what: str) -> Path:
+    """Refuse a path that a mosaic or a video cannot be written to, before long work rather than after it.
 
     Raises
     ------
@@ -166,7 +168,7 @@ def check_mosaic(output: str | Path) -> Path:
     """
     target = Path(output)
     if not target.name.endswith(ENDING):
-        raise OutputError(f"a mosaic is written to a folder ending in {ENDING}; got {output}")
+        raise OutputError(f"a {what} is written to a folder ending in {ENDING}; got {output}")
     folder = target.with_name(target.name[: -len(ENDING)] + ".work")
     if target.exists() and not folder.exists():
         raise OutputError(f"{target} is there already; choose another name, or remove it")
@@ -188,7 +190,7 @@ def _draw(
     located: Located, paths: tuple[Path, ...], smoothness: float, client: Any | None
 ) -> Generator[Doing, None, None]:
     work, track, acquisition = located.work, located.track, located.work.source.acquisition
-    unit = {"µm": "micrometer", "nm": "nanometer", "mm": "millimeter"}.get(acquisition.unit or "")
+    unit = OME_UNITS.get(acquisition.unit or "")
     work.begin("tiles")
     plan = _Plan(track=track, paths=tuple(map(str, paths)), smoothness=smoothness)
     if not work.shared("tiles").exists():  # tiles that are drawn already stay
@@ -265,22 +267,22 @@ def _frames_behind(track: Track, frames: NDArray[np.int64], grid: Grid, bundle: 
     return torch.from_numpy(count)
 
 
-def write_poses(path: Path, track: Track, source: FrameSource) -> None:
+def write_poses(path: Path, track: Track, source: FrameSource, pictures: Mapping[int, Grid]) -> None:
     """Write where frames lie as CSV: frame, seconds, piece, used, and h00 to h22.
 
-    The matrix leads from frame pixels to pixels of the piece's picture, (x, y), integers at pixel centres.
+    The matrix leads from frame pixels to pixels of the picture of the frame's piece, (x, y), integers at pixel centres.
+    Frames of pieces that have no picture are not used.
     """
     times = source.acquisition.times
-    origins = {piece: picture_of(track, piece) for piece in range(track.pieces)}
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", "seconds", "piece", "used", *(f"h{i}{j}" for i in range(3) for j in range(3))])
     for number, (matrix, piece) in enumerate(zip(track.planes(), track.piece, strict=True)):
         seconds = "" if times is None else repr(float(times[number]))
-        if piece < 0:
+        if piece not in pictures:
             writer.writerow([number, seconds, "", 0, *[""] * 9])
             continue
-        grid = origins[int(piece)]
+        grid = pictures[int(piece)]
         placed = np.array([[1, 0, -grid.x0], [0, 1, -grid.y0], [0, 0, 1]]) @ matrix
         writer.writerow([number, seconds, int(piece), 1, *(repr(float(value)) for value in placed.ravel())])
     with write_whole(path) as stream:

@@ -21,7 +21,16 @@ _LEAST_FRAMES = 6.0
 _MEDIAN_SIZE = 0.6745
 
 
-def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor) -> Tensor:
+def find_outliers(
+    samples: Samples,
+    points: Tensor,
+    grid: Grid,
+    filtered: Tensor,
+    *,
+    far: float = _FAR,
+    least_size: float = _LEAST_SIZE,
+    spread: float = 1.0,
+) -> Tensor:
     """Return which samples show something else than the scene, (T, N) bool.
 
     Something else covers several cores, so residuals are averaged over neighbours of a frame, which noise and wrong
@@ -39,9 +48,15 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
         Of the scene.
     filtered : Tensor
         (C, H, W), the scene as samples see it through their footprint.
+    far : float
+        In standard deviations of the residuals as they usually are there: what is farther off is something else.
+    least_size : float
+        In parts of the contrast of the samples: what differs by less is none.
+    spread : float
+        Over this Gaussian, in pitches, neighbours are averaged.
     """
     height, width = samples.shape
-    in_frame = Grid.over((0, 0, width - 1, height - 1), samples.pitch).at(samples.positions)
+    in_frame = Grid.over((0, 0, width - 1, height - 1), min(1.0, spread) * samples.pitch).at(samples.positions)
     off, weights = torch.zeros_like(samples.weights), torch.zeros_like(samples.weights)
     for frame, values, light, weight in predict(samples, points, grid, filtered):
         off[frame] = _smooth(in_frame, (values - light).mean(dim=1), weight)
@@ -58,15 +73,15 @@ def find_outliers(samples: Samples, points: Tensor, grid: Grid, filtered: Tensor
     there = _smooth(coarse, size.clamp(max=float(3 * usual)), weights) * math.sqrt(math.pi / 2)
     score = size / torch.maximum(torch.maximum(there, usual), torch.maximum(of_frame, of_core)).clamp_min(1e-12)
     counted &= _is_shared(coarse, in_frame, weights)
-    far = (score > _FAR) & (size > _LEAST_SIZE * samples.contrast) & counted
-    if not bool(far.any()):
-        return far
-    also = torch.zeros_like(far)
-    nodes = max(1.0, _ABOUT)
-    for frame in far.any(dim=1).nonzero().flatten().tolist():
-        near = in_frame(blur(in_frame.adjoint(far[frame].to(off)), nodes)) > 0.02
+    found = (score > far) & (size > least_size * samples.contrast) & counted
+    if not bool(found.any()):
+        return found
+    also = torch.zeros_like(found)
+    nodes = max(1.0, _ABOUT / min(1.0, spread))
+    for frame in found.any(dim=1).nonzero().flatten().tolist():
+        near = in_frame(blur(in_frame.adjoint(found[frame].to(off)), nodes)) > 0.02
         also[frame] = near & (score[frame] > _ALSO) & counted[frame]
-    return far | also
+    return found | also
 
 
 def _is_shared(coarse: Sampling, in_frame: Sampling, weights: Tensor) -> Tensor:

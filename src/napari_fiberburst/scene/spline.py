@@ -99,6 +99,26 @@ class NormalEquations:
         paths = (*self.paths, *other.paths)
         return replace(self, bands=self.bands + other.bands, rhs=self.rhs + other.rhs, paths=paths)
 
+    def __sub__(self, other: "NormalEquations") -> "NormalEquations":
+        """Forget samples that were added; those that looked along paths cannot be told apart any more."""
+        return replace(self, bands=self.bands - other.bands, rhs=self.rhs - other.rhs)
+
+    def on(self, grid: Grid) -> "NormalEquations":
+        """Return the equations on another grid whose nodes lie at the same places, wider or narrower than this one.
+
+        What nodes beyond the other grid are tied to is taken for 0.
+        """
+        offsets = ((self.grid.y0, grid.y0), (self.grid.x0, grid.x0))
+        there, here = [], []
+        for (mine, new), own, side in zip(offsets, self.grid.shape, grid.shape, strict=True):
+            start = round((mine - new) / grid.spacing)
+            first, last = max(0, start), max(0, start, min(side, start + own))
+            there.append(slice(first, last))
+            here.append(slice(first - start, last - start))
+        bands, rhs = (part.new_zeros(len(part), *grid.shape) for part in (self.bands, self.rhs))
+        bands[:, *there], rhs[:, *there] = self.bands[:, *here], self.rhs[:, *here]
+        return replace(self, grid=grid, bands=bands, rhs=rhs)
+
     def without_paths(self) -> "NormalEquations":
         """Return the equations to keep once they are solved: of the middle of each path."""
         return replace(self, paths=())
@@ -123,7 +143,10 @@ class NormalEquations:
     @property
     def footprint(self) -> Footprint | None:
         """B, the footprint of the samples; None for points."""
-        return None if self.radius is None else Footprint.cached(self.grid, self.radius, self.rhs.device)
+        if self.radius is None:
+            return None
+        # A filter is the same wherever the grid lies.
+        return Footprint.cached(replace(self.grid, x0=0.0, y0=0.0), self.radius, self.rhs.device)
 
     @property
     def prior(self) -> SmoothnessPrior:
