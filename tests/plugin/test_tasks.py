@@ -30,7 +30,12 @@ def calibrate(task, qtbot):
 
 def test_one_task_is_shown_at_a_time_over_the_same_burst(open_dock, burst_layer):
     _, dock = open_dock(burst_layer)
-    assert [dock.task_bar.tabText(number) for number in range(dock.task_bar.count())] == ["Picture", "Bundle"]
+    assert [dock.task_bar.tabText(number) for number in range(dock.task_bar.count())] == [
+        "Picture",
+        "Video",
+        "Mosaic",
+        "Bundle",
+    ]
     for number, shown in enumerate(dock.tasks):
         dock.task_bar.setCurrentIndex(number)
         assert [task.isHidden() for task in dock.tasks] == [task is not shown for task in dock.tasks]

@@ -101,15 +101,28 @@ def write_tile(path: Path, rows: tuple[int, int], columns: tuple[int, int], tile
     level[..., slice(*rows), slice(*columns)] = tile.astype(np.float32)
 
 
-def coarsen(path: Path) -> None:
-    """Make an image's coarser levels from its finest one, a strip at a time: means of what is known."""
+def coarsen(path: Path, rows: tuple[int, int] | None = None, columns: tuple[int, int] | None = None) -> None:
+    """Make an image's coarser levels from its finest one, a strip at a time: means of what is known.
+
+    Parameters
+    ----------
+    path : Path
+        Of the image's group.
+    rows, columns : (int, int), optional
+        The part [first, last) of the finest level that has changed; default, all of it.
+    """
     group = zarr.open_group(path, mode="r+")
     count = sum(1 for _ in group.array_keys())
     for level in range(1, count):
         fine, coarse = (zarr.open_array(path / str(number), mode="r+") for number in (level - 1, level))
-        for top in range(0, coarse.shape[-2], CHUNK):
-            strip = np.asarray(fine[..., 2 * top : 2 * (top + CHUNK), :])
-            coarse[..., top : top + CHUNK, :] = _halved(strip)
+        (top, bottom), (left, right) = (
+            (0, length) if part is None else (part[0] >> level, -(-part[1] >> level))
+            for part, length in zip((rows, columns), coarse.shape[-2:], strict=True)
+        )
+        for first in range(top, bottom, CHUNK):
+            last = min(first + CHUNK, bottom)
+            strip = np.asarray(fine[..., 2 * first : 2 * last, 2 * left : 2 * right])
+            coarse[..., first:last, left:right] = _halved(strip)
 
 
 def _halved(image: NDArray[np.float32]) -> NDArray[np.float32]:

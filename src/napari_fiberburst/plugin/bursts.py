@@ -13,6 +13,7 @@ from napari_fiberburst.data.burst import MIN_SIDE, Burst
 from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
+from napari_fiberburst.plugin.scrubbing import Frames
 
 _LABELS = {"t": "T", "time": "T", "frame": "T", "c": "C", "channel": "C", "y": "Y", "x": "X", "z": "Z"}
 _PIXEL_UNITS = ("pixel", "dimensionless")
@@ -49,6 +50,8 @@ class BurstSource:
         Order of the axes of each array, such as "TYX", "TYXC" or "CTYX"; one frame has no T.
     region : ((int, int), (int, int)) or None
         Rows and columns, half-open, of the part that is used.
+    chosen : range or None
+        The frames of the layers that the arrays hold; None where they hold all.
     pixel_size : (float, float) or None
         Height and width of a pixel, in `unit`.
     unit : str or None
@@ -71,6 +74,7 @@ class BurstSource:
     arrays: tuple[Any, ...]
     axes: str
     region: Region | None = None
+    chosen: range | None = None
     pixel_size: tuple[float, float] | None = None
     unit: str | None = None
     channel_names: tuple[str, ...] = ()
@@ -117,9 +121,9 @@ class BurstSource:
     def frames(self) -> Any:
         """The burst as it came, (T, H, W) or (T, H, W, C), the region alone; lazy where the layer's data are."""
         if self.region is None:
-            return self._whole()
+            return self.whole
         (y0, y1), (x0, x1) = self.region
-        return self._whole()[:, y0:y1, x0:x1]
+        return self.whole[:, y0:y1, x0:x1]
 
     def read(self) -> Burst:
         """Make the burst; may take as long as reading the file does.
@@ -130,13 +134,31 @@ class BurstSource:
             The layers are no usable burst.
         """
         burst = Burst(
-            self._whole(),
+            self.whole,
             channel_names=self.channel_names,
             pixel_size=self.pixel_size,
             unit=self.unit,
             times=self.times,
         )
         return burst if self.region is None else burst.crop(*self.region)
+
+    def take(self, frames: range) -> "BurstSource":
+        """Return a burst of these frames of the layers, still unread."""
+        at = self.axes.index("T")
+        part = (slice(None),) * at + (_slice(frames),)
+        inner = f"[{', '.join([*[':'] * at, _written(frames)])}]"
+        return replace(
+            self,
+            arrays=tuple(
+                array.take(frames) if isinstance(array, Frames) and at == 0 else array[part] for array in self.arrays
+            ),
+            chosen=frames,
+            times=None if self.times is None else self.times[_slice(frames)],
+            words=tuple(word + inner for word in self.words),
+            path=None,
+            recipe={},
+            truth=None,
+        )
 
     def some(self, frames: Sequence[int], rows: tuple[int, int], columns: tuple[int, int]) -> "BurstSource":
         """Return the burst of some frames, and of these rows and columns, half-open, of what is used of them."""
@@ -146,7 +168,8 @@ class BurstSource:
         region = ((y0 + rows[0], y0 + rows[1]), (x0 + columns[0], x0 + columns[1]))
         return replace(self, arrays=taken, region=region, times=None, truth=None)
 
-    def _whole(self) -> Any:
+    @property
+    def whole(self) -> Any:
         """Return all of every frame, (T, H, W) or (T, H, W, C), in the layers' own type."""
         axes, data = self.axes, self.arrays[0]
         if len(self.arrays) > 1:
@@ -158,8 +181,19 @@ class BurstSource:
             axes, data = axes + "C", np.stack(self.arrays, axis=-1)
         for axis in [axis for axis in axes if axis not in "TYXC"]:
             data, axes = data[(slice(None),) * axes.index(axis) + (0,)], axes.replace(axis, "")
+        if isinstance(data, Frames):
+            data = np.asarray(data)
         ordered = data.transpose([axes.index(axis) for axis in "TYXC" if axis in axes])
         return ordered if "T" in axes else ordered[None]
+
+
+def _slice(frames: range) -> slice:
+    return slice(frames.start, frames.stop if frames.stop >= 0 else None, frames.step)
+
+
+def _written(frames: range) -> str:
+    """Return a range as Python writes a slice."""
+    return f"{frames.start}:{frames.stop}" + (f":{frames.step}" if frames.step != 1 else "")
 
 
 def source_of(layers: Sequence[Image], axes: str, region: Region | None = None) -> BurstSource:

@@ -19,6 +19,8 @@ from qtpy.QtGui import QHelpEvent
 from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 
 from napari_fiberburst.plugin.contributions import PLUGIN
+from napari_fiberburst.plugin.tasks.long import LongTask
+from napari_fiberburst.plugin.tasks.video import VideoTask
 
 if TYPE_CHECKING:
     import napari
@@ -50,14 +52,19 @@ class Command:
     act: Callable[[Any], None] = QAbstractButton.click
 
 
+def _going(dock: Any) -> Any:
+    """Return the task whose run is meant: the one that is shown, or else that which makes pictures."""
+    return dock.task if isinstance(dock.task, LongTask) else dock.picture
+
+
 COMMANDS = {
     "start": Command(
         title="Start the task that is shown", key="Ctrl-Enter", widget=lambda dock: dock.task.start_button
     ),
     "pause": Command(
-        title="Pause the run, or continue it", key="Ctrl-Shift-H", widget=lambda dock: dock.picture.pause_button
+        title="Pause the run, or continue it", key="Ctrl-Shift-H", widget=lambda dock: _going(dock).pause_button
     ),
-    "stop": Command(title="Stop the run and keep it", key="Ctrl-Shift-E", widget=lambda dock: dock.picture.stop_button),
+    "stop": Command(title="Stop the run and keep it", key="Ctrl-Shift-E", widget=lambda dock: _going(dock).stop_button),
     "compare": Command(
         title="Compare two images", key="Ctrl-Shift-B", widget=lambda dock: dock.picture.runs.compare.button
     ),
@@ -65,6 +72,11 @@ COMMANDS = {
     "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
     "figure": Command(
         title="Save a figure", key=None, widget=lambda dock: dock.picture.display.card.report.figure_button
+    ),
+    "movie": Command(
+        title="Save the video as MP4",
+        key=None,
+        widget=lambda dock: next(task for task in dock.tasks if isinstance(task, VideoTask)).movie_button,
     ),
     "next_run": Command(
         title="Next run",
@@ -93,6 +105,9 @@ class KeyHints(QObject):
     def __init__(self, dock: "FiberBurstWidget") -> None:
         super().__init__(dock)
         self._names: dict[QObject, list[str]] = {task.start_button: ["start"] for task in dock.tasks}
+        for task in dock.tasks:
+            if isinstance(task, LongTask):
+                self._names |= {task.pause_button: ["pause"], task.stop_button: ["stop"]}
         for name, command in COMMANDS.items():
             names = self._names.setdefault(command.widget(dock), [])
             names.extend({name}.difference(names))
@@ -144,7 +159,7 @@ def press(name: str) -> None:
 
 start, pause, stop = partial(press, "start"), partial(press, "pause"), partial(press, "stop")
 compare, save = partial(press, "compare"), partial(press, "save")
-report, figure = partial(press, "report"), partial(press, "figure")
+report, figure, movie = partial(press, "report"), partial(press, "figure"), partial(press, "movie")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
 
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import tifffile
 
-from napari_fiberburst.io.read import ARCHIVE_ENDINGS
+from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
+from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
@@ -67,25 +68,16 @@ def make_sample(scene: str, physics: str, **faults: Any) -> list[LayerData]:
 
 def recording_slide() -> list[LayerData]:
     """Return a long simulated recording as an image layer, each frame made when it is shown; truth as `make_sample`."""
-    from napari_fiberburst.plugin.stacks import as_read
+    from napari_fiberburst.plugin.recordings import recording_layer
     from napari_fiberburst.simulation import simulate_recording
 
     recording = simulate_recording("slide", frames=_RECORDING_FRAMES, **_RECORDING_SETTINGS)
-    known, times = recording.source.acquisition, recording.source.acquisition.times
-    look = {
-        "name": f"recording, {_RECORDING_FRAMES:,} frames",
-        "rgb": False,
-        "axis_labels": ("t", "y", "x"),
-        "contrast_limits": (known.black_level, known.white_level),
-        "metadata": {
-            METADATA_KEY: {
-                "recipe": {"scene": "slide", "frames": _RECORDING_FRAMES, **_RECORDING_SETTINGS},
-                RECORDING_KEY: {"channel_names": (), "times": () if times is None else times.tolist()},
-                **recording.arrays(),
-            }
-        },
+    frames, look, kind = recording_layer(recording.source, f"recording, {_RECORDING_FRAMES:,} frames")
+    look["metadata"][METADATA_KEY] |= {
+        "recipe": {"scene": "slide", "frames": _RECORDING_FRAMES, **_RECORDING_SETTINGS},
+        **recording.arrays(),
     }
-    return [(as_read(recording.source), look, "image")]
+    return [(frames, look, kind)]
 
 
 # napari calls a sample by a name of its own, without arguments.
@@ -105,13 +97,16 @@ retina_round = partial(make_sample, "retina", "core", field=0.95, overlay=True, 
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
-    """Return a reader for a folder of frames, a simulated burst or a bundle, None for anything else."""
+    """Return a reader for a recording, a folder of frames, a simulated burst or a bundle, None for anything else.
+
+    Several videos, which napari gives where they are to be one stack, are one recording.
+    """
     if not isinstance(path, str):
-        return None
+        return read if path and all(Path(one).suffix.lower() in VIDEO_ENDINGS for one in path) else None
     place = Path(path)
     if place.suffix.lower() == ".bundle":
         return read_bundle
-    is_burst = place.suffix.lower() in ARCHIVE_ENDINGS or (place.is_dir() and _holds_frames(place))
+    is_burst = place.suffix.lower() in (*ARCHIVE_ENDINGS, *VIDEO_ENDINGS) or (place.is_dir() and _holds_frames(place))
     return read if is_burst else None
 
 
@@ -167,13 +162,20 @@ def bundle_layers(bundle: "Bundle", name: str, *, path: str | None = None) -> li
 def read(path: str | Sequence[str]) -> list[LayerData]:
     """Open a burst as an image layer, with pixel size, unit and, where the file has it, the truth.
 
+    Of a recording that is longer than a burst, frames are read when they are shown.
+
     Raises
     ------
     BurstError
         The file or folder is no usable burst.
     """
-    from napari_fiberburst.io import read_burst
+    from napari_fiberburst.io import open_recording, read_burst
+    from napari_fiberburst.plugin.recordings import LONGEST_BURST, name_of, recording_layer
 
+    if not isinstance(path, str) or Path(path).suffix.lower() not in ARCHIVE_ENDINGS:
+        source = open_recording(path if isinstance(path, str) else [Path(one) for one in path])
+        if len(source) > LONGEST_BURST or not isinstance(path, str):
+            return [recording_layer(source, name_of(path), path)]
     burst = read_burst(str(path))
     frames = _as_recorded(burst)
     look = _look(
@@ -239,7 +241,7 @@ def _start(show: str) -> None:
 def _holds_frames(folder: Path) -> bool:
     from napari_fiberburst.io.folder import IMAGE_ENDINGS
 
-    return any(item.suffix.lower() in IMAGE_ENDINGS for item in folder.iterdir())
+    return any(item.suffix.lower() in (*IMAGE_ENDINGS, *VIDEO_ENDINGS) for item in folder.iterdir())
 
 
 def _as_recorded(burst: "Burst") -> np.ndarray:

@@ -109,6 +109,8 @@ class FiberBurstWidget(QWidget):
     def _show_task(self, number: int) -> None:
         for task in self.tasks:
             task.setVisible(task is self.tasks[number])
+        self.input.frames.set_wanted(is_wanted=self.tasks[number].needs_burst)
+        self.glance.setVisible(self.tasks[number].needs_burst)
 
     def _show_or_invite(self) -> None:
         """Show what can be done with a burst, and what is kept of runs; offer to open one where there is none."""

@@ -11,14 +11,17 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog, QLabel, QMenu, QPushButton, QVBoxLayout, QWidget
 from superqt.utils import create_worker
 
-from napari_fiberburst.io.read import ARCHIVE_ENDINGS
+from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
+from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.plugin.contributions import PLUGIN, LayerData, read
 from napari_fiberburst.plugin.problems import why
 from napari_fiberburst.plugin.sections import row_of
 
-_FILES = " ".join(f"*{ending}" for ending in (*TIFF_ENDINGS, *ARCHIVE_ENDINGS))
-_INVITATION = "Open the frames of a burst: 10 to 20 that moved a little. Or drop them on the window."
+_FILES = " ".join(f"*{ending}" for ending in (*TIFF_ENDINGS, *ARCHIVE_ENDINGS, *VIDEO_ENDINGS))
+_INVITATION = (
+    "Open a burst, 10 to 20 frames that moved a little, or a recording of any length. Or drop it on the window."
+)
 
 
 class EmptyBox(QWidget):
@@ -45,7 +48,7 @@ class EmptyBox(QWidget):
         self.words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.open_button, self.folder_button = QPushButton("Open…"), QPushButton("Open folder…")
         self.sample_button = QPushButton("Try a sample")
-        self.open_button.setToolTip("Open a TIFF stack, or a burst of fiberburst simulate.")
+        self.open_button.setToolTip("Open a video, a TIFF stack, or a burst of fiberburst simulate.")
         self.folder_button.setToolTip("Open a folder of PNG or TIFF frames, or an OME-Zarr image.")
         self.sample_button.setToolTip("Simulate a burst whose truth is known.")
         self.samples = QMenu(self.sample_button)
@@ -64,7 +67,9 @@ class EmptyBox(QWidget):
         self._load(partial(read, path), f"Opening {path}")
 
     def _ask_for_file(self) -> None:
-        path, _ = QFileDialog.getOpenFileName(self, "Open a burst", "", f"Bursts ({_FILES})")
+        path, _ = QFileDialog.getOpenFileName(
+            self, "Open a burst or a recording", "", f"Bursts and recordings ({_FILES})"
+        )
         if path:
             self.open(path)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _HEIGHT, _WIDTH, _MOST = 40, 320, 7
 
 
-# The layers' arrays, why they are no burst, and axes and region of one.
+# The layers' arrays, why they are no burst, and axes, region and frames of one.
 _Asked = tuple[list[Any], str, Any]
 
 
@@ -71,7 +71,7 @@ class GlanceBox(QWidget):
             problem = ""
         except FiberBurstError as error:
             source, problem = None, str(error)
-        asked = (arrays, problem, source and (source.axes, source.region))
+        asked = (arrays, problem, source and (source.axes, source.region, source.chosen))
         if self._asked is not None and _is_same(asked, self._asked):
             return
         self._asked = asked
@@ -126,13 +126,18 @@ def in_words(source: BurstSource) -> str:
     frames, height, width, channels = source.shape
     kinds = {1: "grey", 3: "RGB"}
     parts = [
-        f"{frames} frame{'s' if frames > 1 else ''}",
+        f"{frames} frame{'s' if frames > 1 else ''}{_among(source)}",
         f"{height} x {width}",
         kinds.get(channels, f"{channels} channels"),
     ]
     if source.pixel_size is not None:
         parts.append(f"{sum(source.pixel_size) / 2:.3g} {source.unit}")
     return ", ".join(parts)
+
+
+def _among(source: BurstSource) -> str:
+    """Return which frames of a recording are meant."""
+    return "" if source.chosen is None else f" of a recording, {source.chosen[0]} to {source.chosen[-1]}"
 
 
 def seen_of(source: BurstSource, asked: "_Asked") -> "tuple[_Asked, Glance, NDArray[np.uint8]]":

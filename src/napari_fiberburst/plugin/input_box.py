@@ -14,6 +14,7 @@ from napari_fiberburst.errors import BurstError, FiberBurstError
 from napari_fiberburst.plugin.bundles import BundleSource, bundle_source, is_result, may_be_bundle, may_be_burst
 from napari_fiberburst.plugin.bursts import BurstSource, guess_axes, region_of, source_of
 from napari_fiberburst.plugin.contributions import LayerData, read_bundle
+from napari_fiberburst.plugin.frames_row import FramesRow
 from napari_fiberburst.plugin.pickers import LayerPicker
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.recorded import take_recording
@@ -34,6 +35,8 @@ class InputBox(QWidget):
     ----------
     burst, bundle, region : LayerPicker
         Their `value` is the layer chosen, or None.
+    frames : FramesRow
+        Which frames of a long recording are the burst.
     axes : QLineEdit
         Order of the burst's axes.
     more : QCollapsible
@@ -52,6 +55,7 @@ class InputBox(QWidget):
             viewer, lambda layer: isinstance(layer, Shapes) and not is_result(layer), "whole frame"
         )
         self.open_button = QPushButton("Open…")
+        self.frames = FramesRow(viewer)
         self.axes = QLineEdit()
         self.channels = QListWidget()
         self._listed: list[Image] = []
@@ -63,6 +67,7 @@ class InputBox(QWidget):
             picker.changed.connect(lambda _: self.changed.emit())
         self.open_button.clicked.connect(self._ask_and_open)
         self.axes.textChanged.connect(self._take_axes)
+        self.frames.changed.connect(self.changed)
         self.channels.itemChanged.connect(lambda _: self.changed.emit())
         self._take_burst()
 
@@ -87,7 +92,7 @@ class InputBox(QWidget):
         FiberBurstError
             None is, its axes are unknown, it is one frame and no bundle is chosen, or the region is of no use.
         """
-        whole = self._whole()
+        whole = self.recorded()
         if "T" not in whole.axes and self.bundle.value is None:
             raise BurstError(
                 f"a burst needs the axes T, Y, X and perhaps C, and layer {whole.name!r} has the axes {whole.axes}; "
@@ -95,7 +100,9 @@ class InputBox(QWidget):
                 "one stack"
             )
         layers, shapes = self.layers, self.region.value
-        return whole if shapes is None else source_of(layers, whole.axes, region_of(shapes, layers[0], whole.axes))
+        used = whole if shapes is None else source_of(layers, whole.axes, region_of(shapes, layers[0], whole.axes))
+        frames = self.frames.chosen(whole)
+        return used if frames is None else used.take(frames)
 
     def bundle_source(self) -> BundleSource | None:
         """Return the bundle that is chosen; None where none is."""
@@ -129,13 +136,13 @@ class InputBox(QWidget):
     def placement(self, source: BurstSource) -> Placement:
         """Return where the burst stands in the viewer."""
         (row, _), (column, _) = source.region or ((0, 0), (0, 0))
-        return Placement.of(self.layers, source.axes, (row, column))
+        return Placement.of(self.layers, source.axes, (row, column), source.chosen)
 
     def set_enabled(self, is_enabled: bool) -> None:
         """Lock or unlock what a running fit has taken."""
         for picker in (self.burst, self.bundle, self.region):
             picker.enabled = is_enabled
-        for widget in (self.axes, self.open_button, self.channels):
+        for widget in (self.axes, self.open_button, self.channels, self.frames):
             widget.setEnabled(is_enabled)
 
     def _lay_out(self) -> None:
@@ -170,11 +177,18 @@ class InputBox(QWidget):
         whole = QVBoxLayout(self)
         whole.setContentsMargins(0, 0, 0, 0)
         whole.addLayout(first)
+        whole.addWidget(self.frames)
         self.more = section("More input", content)
         whole.addWidget(self.more)
 
-    def _whole(self) -> BurstSource:
-        """Return the layers chosen, by the axes given, without a region."""
+    def recorded(self) -> BurstSource:
+        """Return all frames of the layers chosen, by the axes given, without a region.
+
+        Raises
+        ------
+        FiberBurstError
+            None is chosen, or the axes are unknown.
+        """
         layers = self.layers
         if not layers:
             raise BurstError(
@@ -192,7 +206,7 @@ class InputBox(QWidget):
     def _place_of_frames(self, shape: tuple[int, int]) -> dict[str, Any]:
         """Return where the burst's frames lie in the viewer; nothing where they have another size."""
         with suppress(FiberBurstError):
-            whole = self._whole()
+            whole = self.recorded()
             if whole.shape[1:3] == shape:
                 return Placement.of(self.layers, whole.axes, (0, 0)).on_canvas("YX")
         return {}
@@ -212,12 +226,21 @@ class InputBox(QWidget):
             self.axes.setText(axes)
             if layer is not None and not {"T", "Y", "X"} <= set(axes):
                 self.more.expand(animate=False)  # where they can be corrected
+            self._offer_frames()
         self._list_channels()
         self.changed.emit()
 
     def _take_axes(self) -> None:
+        self._offer_frames()
         self._list_channels()
         self.changed.emit()
+
+    def _offer_frames(self) -> None:
+        """Offer to choose frames where there are more than a burst has."""
+        whole = None
+        with suppress(FiberBurstError):
+            whole = self.recorded()
+        self.frames.take(whole)
 
     def _alike(self) -> list[Image]:
         """Return the layers that could be further channels of the burst chosen."""

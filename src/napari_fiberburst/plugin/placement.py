@@ -57,20 +57,27 @@ class Placement:
     channels: tuple[str, ...]
 
     @classmethod
-    def of(cls, layers: Sequence[Image], axes: str, origin: tuple[int, int]) -> "Placement":
-        """Note where the burst is; `axes` names the axes of each layer's data."""
+    def of(
+        cls, layers: Sequence[Image], axes: str, origin: tuple[int, int], frames: range | None = None
+    ) -> "Placement":
+        """Note where the burst is; `axes` names the axes of each layer's data, `frames` those of them it is made of."""
         layer = layers[0]
         shape = (layer.data[0] if layer.multiscale else layer.data).shape
         sizes = dict(zip(axes, shape, strict=True))
         own = axes.replace("C", "") if layer.rgb else axes
+        scale, translate = [float(value) for value in layer.scale], [float(value) for value in layer.translate]
+        if frames is not None:
+            sizes["T"], at = len(frames), own.index("T")
+            translate[at] += scale[at] * frames.start
+            scale[at] *= frames.step
         # Axes of length 1 in front are the viewer's to fill in.
         first = next(position for position, axis in enumerate(own) if axis in "TYXC")
         return cls(
             axes=own[first:],
             sizes=sizes,
             rgb=layer.rgb,
-            scale=tuple(float(value) for value in layer.scale[first:]),
-            translate=tuple(float(value) for value in layer.translate[first:]),
+            scale=tuple(scale[first:]),
+            translate=tuple(translate[first:]),
             units=tuple(layer.units[first:]),
             axis_labels=tuple(layer.axis_labels[first:]),
             world_from_data=_world_from_data(layer),

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from napari_fiberburst.coordinates import transform_points
-from napari_fiberburst.data.source import FrameSource
 
 if TYPE_CHECKING:
     from napari_fiberburst.data.canvas import Canvas
@@ -21,24 +20,6 @@ _INVERSIONS = 8
 
 # Frame number to (H, W, 2): what takes each of its pixels to the reference frame's.
 Flow = Callable[[int], NDArray[np.float64]]
-
-
-def as_read(source: FrameSource) -> da.Array:
-    """Return the frames of a recording, (T, H, W) or (T, H, W, C), each read when it is wanted."""
-    count, *sides = source.shape
-    known = source.acquisition
-    sides = sides if "C" in known.axes else sides[:2]
-
-    def frame(block_id: tuple[int, ...]) -> NDArray[np.generic]:
-        return source.recorded([block_id[0]]).reshape(1, *sides)
-
-    return da.map_blocks(
-        frame,
-        chunks=((1,) * count, *((side,) for side in sides)),
-        dtype=known.dtype,
-        meta=np.empty((0,) * (1 + len(sides)), known.dtype),
-        name=f"recording-{source.fingerprint}",
-    )
 
 
 def stabilised(frames: Any, homographies: NDArray[np.float64], canvas: "Canvas", flow: Flow | None = None) -> da.Array:

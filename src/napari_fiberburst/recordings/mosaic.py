@@ -242,9 +242,13 @@ def _draw(
             for name in _FURTHER:
                 create_pyramid(path / name, grid.shape, name=name, pixel_size=size, unit=unit)
         plan.save(work.shared("tiles"))
-    units = range(len(_tiles(track, work.bundle.pitch)))
-    for _, left in complete(draw_unit, "tiles", work, units, client):
-        yield Doing("solving the scene", left=left, units=len(units))
+    tiles = _tiles(track, work.bundle.pitch)
+    # What another run has drawn is seen at once; a tile at every zoom once it is drawn.
+    yield Doing("solving the scene", left=len(tiles), units=len(tiles), grown=paths[0])
+    for number, left in complete(draw_unit, "tiles", work, range(len(tiles)), client):
+        piece, tile = tiles[number]
+        coarsen(paths[piece], tile.rows, tile.columns)
+        yield Doing("solving the scene", left=left, units=len(tiles), grown=paths[piece])
 
 
 def draw_unit(work: Work, stage: str, number: int) -> None:

@@ -87,6 +87,8 @@ class Doing:
         The number of the step, and how many there are of this kind.
     left, units : int
         How many of its units are left, of how many.
+    grown : Path or None
+        An image on disk that shows more than before, at every zoom; None where none does.
     """
 
     what: str
@@ -94,6 +96,7 @@ class Doing:
     steps: int = 1
     left: int = 0
     units: int = 1
+    grown: Path | None = None
 
     @property
     def part(self) -> float:

@@ -30,10 +30,13 @@ class Task(QWidget):
     ----------
     title, tip : str
         How the task is called, and what it does.
+    needs_burst : bool
+        Whether it works on a burst, some frames of a recording; or else on all of it.
     start_button : QPushButton
         Starts it, in another thread.
     """
 
+    needs_burst: ClassVar[bool] = True
     title: ClassVar[str]
     tip: ClassVar[str]
     kept_changed = Signal()  # whether `is_empty` may have

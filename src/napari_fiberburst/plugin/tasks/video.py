@@ -1,0 +1,128 @@
+"""Every frame of a long recording, sharp: it is shown as far as it is solved, kept on disk, and saved as a film."""
+
+from collections.abc import Generator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from napari.utils.notifications import show_error, show_info
+from qtpy.QtWidgets import QCheckBox, QFileDialog, QPushButton, QSpinBox, QWidget
+from superqt.utils import create_worker
+
+from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.plugin.input_box import InputBox
+from napari_fiberburst.plugin.output_row import stem_of
+from napari_fiberburst.plugin.problems import why
+from napari_fiberburst.plugin.tasks.long import LongTask
+
+if TYPE_CHECKING:
+    import napari
+
+    from napari_fiberburst.recordings.video import Video
+    from napari_fiberburst.recordings.work import Doing
+
+# More frames than this behind each show nothing that moves.
+_MOST_FRAMES = 999
+
+
+class VideoTask(LongTask):
+    """Reconstructs every frame of the recording that is chosen, by `napari_fiberburst.recordings.video`.
+
+    Attributes
+    ----------
+    frames_behind : QSpinBox
+        How many frames stand behind each; 0 as the motion asks for.
+    stabilised : QCheckBox
+        Whether the scene stands still.
+    movie_button : QPushButton
+        Saves the video as a film.
+    """
+
+    title: ClassVar[str] = "Video"
+    tip: ClassVar[str] = "Make every frame of a recording sharp, from those about it in time."
+    kind: ClassVar[str] = "video"
+
+    def __init__(self, viewer: "napari.viewer.Viewer", source: InputBox, parent: QWidget | None = None) -> None:
+        super().__init__(viewer, source, parent)
+        self._made: tuple[Path, Acquisition] | None = None
+        self.movie_button.clicked.connect(self._ask_and_save)
+
+    def begin(
+        self, source: FrameSource, output: Path, bundle: Any, settings: dict[str, Any]
+    ) -> "Generator[Doing, None, Video]":
+        """Return the work; called in another thread."""
+        from napari_fiberburst.recordings.video import videoing
+
+        return videoing(source, output, bundle=bundle, regions=None, mp4=None, scale_bar=False, client=None, **settings)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what is set."""
+        return {
+            **super().settings(),
+            "window": self.frames_behind.value() or None,
+            "stabilised": self.stabilised.isChecked(),
+        }
+
+    def more_rows(self) -> dict[str, QWidget]:
+        """Return what a mosaic has no use for."""
+        self.frames_behind, self.stabilised = QSpinBox(), QCheckBox("the scene stands still")
+        self.frames_behind.setRange(0, _MOST_FRAMES)
+        self.frames_behind.setSpecialValueText("auto")
+        self.frames_behind.setAccessibleName("frames behind each")
+        self.frames_behind.setToolTip("How many frames stand behind each; auto, as the motion asks for.")
+        self.stabilised.setToolTip("Frames move over a scene that stands still; else they are shown as they lie.")
+        return {"window": self.frames_behind, "stabilised": self.stabilised}
+
+    def paths_of(self, result: "Video") -> tuple[Path, ...]:
+        """Return the video."""
+        if self.told_of is not None:
+            self._made = (result.path, self.told_of[0].acquisition)
+        return (result.path,)
+
+    def lines_of(self, result: "Video") -> list[str]:
+        """Return how many frames have a place, and what stands behind each."""
+        placed, count = int((result.track.piece >= 0).sum()), len(result.track)
+        return [
+            f"{placed:,} of {count:,} frames have a place; {result.window} stand behind each.",
+            f"The traces of all cores are in {result.traces.name}.",
+        ]
+
+    def card_widgets(self) -> tuple[QWidget, ...]:
+        """Return what can be done with the video."""
+        self.movie_button = QPushButton("Save as MP4…")
+        self.movie_button.setToolTip("Save the video as a film, with a scale bar where the size of a pixel is known.")
+        return (self.movie_button,)
+
+    def save_movie(self, path: str | Path) -> None:
+        """Save the video as a film, in another thread, or say why not."""
+        if self._made is None:
+            return
+        self.movie_button.setEnabled(False)
+        create_worker(
+            _written,
+            *self._made,
+            Path(path),
+            _connect={"returned": self._take_movie, "errored": self._take_error},
+            _ignore_errors=True,
+        )
+
+    def _take_movie(self, path: Path) -> None:
+        self.movie_button.setEnabled(True)
+        show_info(f"wrote {path}")
+
+    def _take_error(self, error: Exception) -> None:
+        self.movie_button.setEnabled(True)
+        show_error(why(error, "a film could not be saved"))
+
+    def _ask_and_save(self) -> None:
+        if self._made is not None:
+            suggested = str(stem_of(self._made[0].with_suffix(""))) + ".mp4"
+            path, _ = QFileDialog.getSaveFileName(self, "Save as MP4", suggested, "Films (*.mp4 *.avi *.mkv)")
+            if path:
+                self.save_movie(path)
+
+
+def _written(video: Path, acquisition: Acquisition, target: Path) -> Path:
+    from napari_fiberburst.recordings.movie import check_movie, write_movie
+
+    return write_movie(video, check_movie(target), acquisition, scale_bar=True)
