@@ -18,7 +18,7 @@ from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.recordings.links import Links
 from napari_fiberburst.recordings.poses import Poses, solve_poses
-from napari_fiberburst.recordings.refine import Refinement, larger_model, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.refine import Refinement, bending, larger_model, refine_unit, refine_units, refined
 from napari_fiberburst.recordings.register import registering
 from napari_fiberburst.recordings.traces import Traces, tracing
 from napari_fiberburst.recordings.track import Track
@@ -30,7 +30,9 @@ from napari_fiberburst.steps import drain
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
 # Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it.
-_ROUNDS, _MOST_ROUNDS, _WORTH = 3, 8, 0.97
+_ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
+# Frames bend where that lowers the error by a part of it.
+_WORTH_BENDING = 0.9
 # Gains and exposures have settled after so many rounds.
 _SETTLED = 2
 # Degrees of freedom of links: frames of fewer are placed anew where they turn.
@@ -88,7 +90,18 @@ def locating(
     traces = yield from tracing(work, client)
     links = yield from registering(work, dof, client)
     track = _first_track(work, traces, solve_poses(links, len(traces), dof))
-    settled = 0
+    track = yield from _refining(work, traces, links, track, is_free=dof is None, client=client)
+    return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+
+
+def _refining(
+    work: Work, traces: Traces, links: Links, track: Track, *, is_free: bool, client: Any | None
+) -> Generator[Doing, None, Track]:
+    """Refine a track until that lowers its error no more; `is_free`, with as much freedom as the frames ask for.
+
+    Frames may bend where that is worth it: it is tried where they ask for stretches.
+    """
+    settled, unbent = 0, None
     for number in range(_MOST_ROUNDS):
         stage, before = f"refined-{number}", track
         work.begin(stage)
@@ -100,12 +113,17 @@ def locating(
         track, settled = refined(track, parts), settled + 1
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
-        asked = larger_model(track, parts) if dof is None and settled >= _SETTLED else track.dof
+        asked = larger_model(track, parts) if is_free and settled >= _SETTLED else track.dof
         if asked > track.dof:
             track, settled = _with_freedom(work, track, links, asked), 0
-        elif number + 1 >= _ROUNDS and track.error > _WORTH * before.error:
+        elif number + 1 < _ROUNDS or settled < _SETTLED or track.error < _WORTH * before.error:
+            continue
+        elif is_free and track.dof > _TURNING and unbent is None:
+            unbent, track, settled = track, bending(track), 0
+        else:
             break
-    return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+    is_worth = unbent is None or track.error < _WORTH_BENDING * unbent.error
+    return track if is_worth or unbent is None else unbent
 
 
 def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:

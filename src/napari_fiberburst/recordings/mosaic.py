@@ -265,7 +265,7 @@ def write_poses(path: Path, track: Track, source: FrameSource) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["frame", "seconds", "piece", "used", *(f"h{i}{j}" for i in range(3) for j in range(3))])
-    for number, (matrix, piece) in enumerate(zip(track.scene_from_frame, track.piece, strict=True)):
+    for number, (matrix, piece) in enumerate(zip(track.planes(), track.piece, strict=True)):
         seconds = "" if times is None else repr(float(times[number]))
         if piece < 0:
             writer.writerow([number, seconds, "", 0, *[""] * 9])

@@ -17,6 +17,8 @@ Complex = NDArray[np.complex128]
 _SCALES = tuple(np.geomspace(30.0, 1.0, 12)) + (1.0,) * 4
 # A link that counts less than this in the end is false.
 _LEAST_TRUST = 0.1
+# Frames that are so much alike show the same place beyond doubt.
+_SURELY_ALIKE = 0.6
 # Turns and zooms are believed where they lower the links' mean square error by more than this for each unknown that
 # they cost. Independent noise would lower it by one; that of links which share frames lowers it by up to four, and
 # turns of a degree by hundreds.
@@ -104,15 +106,31 @@ def _solve(links: Links, count: int, dof: int) -> Poses:
 
 
 def pieces(links: Links, count: int) -> NDArray[np.int64]:
-    """Return the piece that each frame belongs to (T,), the largest first; -1 for frames that are tied to none."""
-    first, second = links.pairs.T
-    graph = csr_array((np.ones(len(links)), (first, second)), shape=(count, count))
-    _, label = connected_components(graph, directed=False)
+    """Return the piece that each frame belongs to (T,), the largest first; -1 for frames that are tied to none.
+
+    A link by which frames are alike beyond doubt ties them; others do where there are two or more between the same
+    pieces, because where nothing is in common some shift is always a little alike.
+    """
+    sure = links.alike >= _SURELY_ALIKE
+    label = _tied(links.pairs[sure], count)
+    while True:
+        ends = np.sort(label[links.pairs[~sure]], axis=1)
+        between, number = np.unique(ends[ends[:, 0] != ends[:, 1]], axis=0, return_counts=True)
+        between = between[number >= 2]
+        if not len(between):
+            break
+        label = _tied(between, int(label.max(initial=0)) + 1)[label]
     sizes = np.bincount(label)
     order = np.argsort(-sizes, kind="stable")
     rank = np.empty(len(sizes), np.int64)
     rank[order] = np.arange(len(sizes))
     return np.where(sizes[label] > 1, rank[label], -1)
+
+
+def _tied(pairs: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return the connected part that each of so many things belongs to."""
+    graph = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 class _Equations:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.grid import Grid, Sampling
+from napari_fiberburst.recordings.bending import basis, control_grid, elastic
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
 from napari_fiberburst.recordings.tiles import pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
@@ -52,6 +53,8 @@ class Refinement(Stored):
         (n,), their numbers.
     scene_from_frame : numpy.ndarray
         (n, 3, 3), where they lie.
+    control : numpy.ndarray or None
+        (n, 2, M), how they bend.
     exposures : numpy.ndarray
         (n,) float32.
     missed : numpy.ndarray
@@ -69,6 +72,7 @@ class Refinement(Stored):
 
     frames: NDArray[np.int64]
     scene_from_frame: NDArray[np.float64]
+    control: NDArray[np.float32] | None
     exposures: NDArray[np.float32]
     missed: NDArray[np.float64]
     alike: NDArray[np.float64]
@@ -99,6 +103,9 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
     return Refinement(
         frames=frames,
         scene_from_frame=np.concatenate([part.scene_from_frame for part in found] or [np.zeros((0, 3, 3))]),
+        control=None
+        if track.control is None
+        else np.concatenate([track.control[:0], *(part.control for part in found if part.control is not None)]),
         exposures=np.concatenate([part.exposures for part in found] or [np.zeros(0, np.float32)]),
         missed=np.concatenate([part.missed for part in found] or [np.zeros(0)]),
         alike=np.concatenate([part.alike for part in found] or [np.zeros(0)]),
@@ -117,11 +124,17 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     residual = samples.grey - light
     typical = (_sums(weights, residual.square()) / weights.sum(dim=1).clamp_min(1e-9)).sqrt().clamp_min(1e-6)
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
-    exposures, matrices, asked = _stepped(track, frames, points, robust, residual, light, (along_x, along_y))
+    slopes = along_x, along_y
+    exposures, matrices, asked, left = _stepped(track, frames, points, robust, residual, light, slopes)
+    control = None
+    if track.control is not None:
+        shown = basis(track.shape, traces.template.positions)
+        control = _bent(torch.from_numpy(track.control[frames]), shown, track.shape, robust, left, slopes, typical)
     agreement, power = _light(samples, sampling, robust, filtered)
     return Refinement(
         frames=frames,
         scene_from_frame=matrices,
+        control=None if control is None else control.numpy(),
         exposures=exposures,
         missed=typical.double().numpy(),
         alike=_correlation(samples.grey, light, weights).double().numpy(),
@@ -145,10 +158,11 @@ def _stepped(
     residual: Tensor,
     light: Tensor,
     slopes: tuple[Tensor, Tensor],
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], Tensor]:
     """Return exposures and places of frames after one step of Gauss-Newton each.
 
-    And by how much each unknown of the two larger models would lower the residuals' square, (n, 2).
+    And by how much each unknown of the two larger models would lower the residuals' square, (n, 2); and what the step
+    leaves of the residuals.
     """
     along_x, along_y = slopes
     half = max(track.shape) / 2
@@ -165,7 +179,7 @@ def _stepped(
     steps = {dof: torch.linalg.solve(normal[:, : dof + 1, : dof + 1], rhs[:, : dof + 1]) for dof in _MODELS}
     lowered = [(step * rhs[:, : step.shape[1]]).sum(dim=1) for step in steps.values()]
     asked = torch.stack([(lowered[1] - lowered[0]) / 2, (lowered[2] - lowered[1]) / 2], dim=1)
-    step = torch.nn.functional.pad(steps[track.dof], (0, 6 - track.dof)).double().numpy()
+    step = torch.nn.functional.pad(steps[track.dof], (0, _MODELS[-1] - track.dof)).double().numpy()
     exposures = track.exposures[frames] * (1 + step[:, 0].clip(-_MOST_EXPOSURE, _MOST_EXPOSURE)).astype(np.float32)
     grown, turned, along, across = step[:, 3:].clip(-_MOST_TURN, _MOST_TURN).T
     change = np.zeros((len(frames), 3, 3))
@@ -174,7 +188,30 @@ def _stepped(
     centre = middle.double().numpy()
     shift = step[:, 1:3].clip(-_MOST_SHIFT, _MOST_SHIFT)
     change[:, :2, 2] = shift + centre - np.einsum("nij,nj->ni", change[:, :2, :2], centre)
-    return exposures, change @ track.scene_from_frame[frames], asked.double().numpy()
+    taken = torch.from_numpy(step).to(residual)
+    left = residual - (taken[:, None] @ jacobian)[:, 0]
+    return exposures, change @ track.scene_from_frame[frames], asked.double().numpy(), left
+
+
+def _bent(
+    control: Tensor,
+    shown: Tensor,
+    shape: tuple[int, int],
+    weights: Tensor,
+    residual: Tensor,
+    slopes: tuple[Tensor, Tensor],
+    typical: Tensor,
+) -> Tensor:
+    """Return how frames bend (n, 2, M) after one step of Gauss-Newton each, held back by elasticity."""
+    found = []
+    for number, one in enumerate(control):
+        jacobian = torch.cat([shown * slope[number][:, None] for slope in slopes], dim=1)
+        weighted = jacobian * weights[number][:, None]
+        prior = torch.kron(torch.eye(2), elastic(shape, float(typical[number]) ** 2))
+        rhs = weighted.T @ residual[number] - prior @ one.reshape(-1)
+        step = torch.linalg.solve(weighted.T @ jacobian + prior, rhs)
+        found.append(one + step.clamp(-_MOST_SHIFT, _MOST_SHIFT).reshape(one.shape))
+    return torch.stack(found)
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:
@@ -186,10 +223,13 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     if not parts:
         return track
     matrices, exposures, alike = (getattr(track, name).copy() for name in ("scene_from_frame", "exposures", "alike"))
+    control = None if track.control is None else track.control.copy()
     missed = np.full(len(track), np.nan)
     for part in parts:
         matrices[part.frames], exposures[part.frames] = part.scene_from_frame, part.exposures
         missed[part.frames], alike[part.frames] = part.missed, part.alike
+        if control is not None and part.control is not None:
+            control[part.frames] = part.control
     piece = np.where(alike >= _LEAST_ALIKE, track.piece, -1)
     for number in range(track.pieces):
         own = piece == number
@@ -204,6 +244,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     return replace(
         track,
         scene_from_frame=matrices,
+        control=control,
         piece=piece,
         exposures=exposures,
         gains=gains / np.median(gains, axis=0),
@@ -211,6 +252,12 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
         alike=alike,
         error=usual,
     )
+
+
+def bending(track: Track) -> Track:
+    """Return the track of frames that may bend, and do not yet."""
+    rows, columns = control_grid(track.shape).shape
+    return replace(track, control=np.zeros((len(track), 2, rows * columns), np.float32))
 
 
 def larger_model(track: Track, parts: list[Refinement]) -> int:

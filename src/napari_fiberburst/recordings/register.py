@@ -1,8 +1,9 @@
 """Step 2 of a long recording: where every frame lies, by pairs of frames in time and wherever the path meets itself."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
+from itertools import combinations
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,6 +26,9 @@ _LOOP_ROUNDS = 2
 _NEAR, _DRIFT = 0.75, 0.25
 # Frames so many places apart belong to other passes of the path; each frame is tied to so many passes at most.
 _PASS, _MOST_PASSES = 8, 10
+# Of so many pieces, the largest, frames are compared with those of others: those that lie this far apart, in parts of
+# the field's shorter side, and so many of a piece.
+_MOST_PIECES, _APART, _MOST_KEPT = 8, 0.4, 24
 # Pairs to a unit of work.
 _PAIRS = 256
 
@@ -93,10 +97,13 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
     side, frames = min(work.bundle.shape), np.flatnonzero(traces.summary.shows)
     tried: set[Pair] = set()
     links, poses = Links.none(), solve_poses(Links.none(), len(traces), 2)
-    rounds = [*(("neighbours", gap) for gap in _GAPS), *[("crossings", 0)] * _LOOP_ROUNDS]
-    for number, (name, gap) in enumerate(rounds):
-        stage = f"links-{number}"
-        chosen = crossings(poses, side) if name == "crossings" else list(neighbours(frames, [gap]))
+    rounds: list[tuple[str, Callable[[Poses], list[Pair]]]] = [
+        *(("neighbours", partial(_at_gap, frames, gap)) for gap in _GAPS),
+        ("meetings", partial(meetings, side=side)),
+        *[("crossings", partial(crossings, side=side))] * _LOOP_ROUNDS,
+    ]
+    for number, (name, choose) in enumerate(rounds):
+        stage, chosen = f"links-{number}", choose(poses)
         pairs = [pair for pair in chosen if pair not in tried]
         tried.update(pairs)
         work.begin(stage)
@@ -108,6 +115,31 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
             links = links + Links.load(work.path(stage, unit))
         poses = solve_poses(links, len(traces), dof)
     return links
+
+
+def _at_gap(frames: NDArray[np.int64], gap: int, poses: Poses) -> list[Pair]:
+    return list(neighbours(frames, [gap]))
+
+
+def meetings(poses: Poses, side: float) -> list[Pair]:
+    """Return pairs of frames of different pieces that may show the same place, though nothing says so.
+
+    Of each of the largest pieces some frames that lie apart.
+    """
+    chosen = []
+    for piece in range(min(int(poses.piece.max(initial=-1)) + 1, _MOST_PIECES)):
+        frames = np.flatnonzero(poses.piece == piece)
+        kept = [int(frames[0])]
+        for frame in frames.tolist():
+            if np.abs(poses.place[frame] - poses.place[kept]).min() > _APART * side:
+                kept.append(frame)
+        chosen.append(kept[:: -(-len(kept) // _MOST_KEPT)])
+    return [
+        (min(one, other), max(one, other))
+        for first, second in combinations(chosen, 2)
+        for one in first
+        for other in second
+    ]
 
 
 def crossings(poses: Poses, side: float) -> list[Pair]:

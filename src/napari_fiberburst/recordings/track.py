@@ -10,7 +10,11 @@ from torch import Tensor
 
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.operators.grid import Grid
+from napari_fiberburst.recordings.bending import basis
 from napari_fiberburst.stored import Stored
+
+# Points along each axis by which a plane is fitted to a frame that bends.
+_FITTED = 16
 
 Bounds = tuple[float, float, float, float]
 
@@ -40,6 +44,9 @@ class Track(Stored):
         Height and width of a frame.
     dof : int
         2 where frames are only shifted, 4 where they turn and grow as well, 6 where they are stretched, too.
+    control : numpy.ndarray or None
+        (T, 2, M) how frames bend beyond that: displacements of control points along x and y, pixels of the scene; None
+        where they do not.
     """
 
     _kind: ClassVar[str] = "track"
@@ -53,6 +60,7 @@ class Track(Stored):
     error: float
     shape: tuple[int, int]
     dof: int
+    control: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.piece)
@@ -66,7 +74,22 @@ class Track(Stored):
         """Return where positions (N, 2) of frames lie in their scene, (n, N, 2)."""
         matrices = torch.from_numpy(self.scene_from_frame[numbers]).to(positions.dtype)
         places: Tensor = transform_points(matrices, positions)
-        return places
+        if self.control is None:
+            return places
+        control = torch.from_numpy(self.control[numbers])
+        return places + (control @ basis(self.shape, positions).T).mT
+
+    def planes(self) -> NDArray[np.float64]:
+        """Return the affine transforms (T, 3, 3) that are nearest to where frames lie, bent as they are."""
+        if self.control is None:
+            return self.scene_from_frame
+        height, width = self.shape
+        x, y = np.meshgrid(np.linspace(0, width - 1, _FITTED), np.linspace(0, height - 1, _FITTED))
+        flat = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+        places = self.points(np.arange(len(self)), torch.from_numpy(flat[:, :2].astype(np.float32))).double().numpy()
+        planes = self.scene_from_frame.copy()
+        planes[:, :2] = np.einsum("kp,tpi->tik", np.linalg.pinv(flat), places)
+        return planes
 
     def corners(self, numbers: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return where the outer pixels' centres of frames lie in their scene, (n, 4, 2)."""
