@@ -4,9 +4,9 @@
     python -m benchmarks.mosaic_once VIDEO RESULT.json --burst FIRST LAST
 
 The result holds `cpu` and `wall`, seconds without imports; `peak`, the most bytes that the process has had, imports
-included, because a machine has to hold them too; and `frames`. With the true places of frames (T, 3, 3), the scene is
-solved once more at those, after the measurement, beside the mosaic as ``true.ome.zarr``; gains, exposures and
-smoothness are those that were found.
+included, because a machine has to hold them too; and `frames`. The track is written beside the mosaic. With the true
+places of frames (T, 3, 3), the scene is solved once more at those, after the measurement, as ``true.ome.zarr``; gains,
+exposures and smoothness are those that were found.
 """
 
 import argparse
@@ -78,8 +78,9 @@ def of_mosaic(source: FrameSource, output: Path, poses: NDArray[np.float64] | No
     with patch.object(mosaics, "locating", keeping):
         made = mosaics.mosaic(source, output)
     found = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall, "peak": most_memory()}
+    made.track.save(output.with_name("track.safetensors"))
     if poses is not None:
-        track = replace(made.track, scene_from_frame=poses)
+        track = replace(made.track, scene_from_frame=poses, control=None)
         true = replace(kept[0], work=replace(kept[0].work, folder=copied), track=track)
         with patch.object(mosaics, "locating", lambda *given, **named: _at_once(true)):
             mosaics.mosaic(source, output.with_name("true.ome.zarr"))

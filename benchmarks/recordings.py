@@ -7,15 +7,16 @@
 Every recording is simulated, so that its truth is exact, and written as FFV1, which loses nothing; each mosaic is made
 of that file in a process of its own, so that neither the simulator's time nor its memory counts. Times are ratios to
 `reconstruct` of a burst of 20 frames in a row out of the same file, in a process of its own right before, because
-machines are shared and noisy. What a mosaic is worth is judged by its OME-Zarr and its table of poses alone:
+machines are shared and noisy. What a mosaic is worth is judged by its OME-Zarr and its table of poses alone,
+a core distance inside its rim:
 
 - places of frames after the one similarity that brings their middles closest to the true ones, because a mosaic has no
   frame of its own;
 - PSNR beside the object itself, at the points where that similarity says that the pixels look, after one gain and
   offset;
 - of tissue that bends there is no one truth: each pixel is held to the object at the point where the frames that have
-  seen it look on average, at their places in the mosaic. So its geometry is free, and what is left is what frames that
-  disagree have blurred.
+  seen it look on average, at their places in the mosaic, bent as the track has them. So its geometry is free, and what
+  is left is what frames that disagree have blurred.
 
 Ends with status 1 where a goal is missed; --quick, smaller and shorter, shows that all of it runs and is held to none.
 """
@@ -34,15 +35,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 import zarr
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import binary_erosion, gaussian_filter, map_coordinates
 
 from benchmarks.results import describe_machine, now
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.quality import match_levels, psnr, ring_correlation
+from napari_fiberburst.recordings.bending import basis
+from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.simulation import SimulatedRecording, simulate_recording
 
 TABLE, FIGURES = "recordings_table.md", "recordings.json"
@@ -121,9 +125,18 @@ class Made:
         return np.array(entries).reshape(-1, 3, 3)
 
     @cached_property
+    def track(self) -> Track:
+        """Places of frames as the package keeps them, with how frames bend, which the table does not say."""
+        return Track.load(self.folder / "track.safetensors")
+
+    @cached_property
     def _table(self) -> list[dict[str, str]]:
         with (self.folder / "wide.poses.csv").open(encoding="utf-8", newline="") as file:
             return list(csv.DictReader(file))
+
+    @cached_property
+    def _planes(self) -> NDArray[np.float64]:
+        return self.track.planes()
 
     def picture(self, piece: int = 0) -> NDArray[np.float64]:
         """Return the picture of a piece (H, W), full scale 1."""
@@ -169,7 +182,7 @@ class Made:
         return self._psnr_of(self.at_true_places, np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]]))
 
     def _psnr_of(self, picture: NDArray[np.float64], frame_from_picture: NDArray[np.float64]) -> float:
-        known = np.isfinite(picture)
+        known = self._inside(picture)
         y, x = np.nonzero(known)
         points = transform_points(frame_from_picture, np.stack([x, y], axis=1).astype(np.float64))
         return psnr(picture[known][None], self.truth.world.sample(points)[:, 0][None])
@@ -189,7 +202,7 @@ class Made:
             rows = np.arange(max(0, int(top)), min(shape[0], int(bottom) + 1))
             columns = np.arange(max(0, int(left)), min(shape[1], int(right) + 1))
             places = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-            x, y = transform_points(np.linalg.inv(self.placed[frame]), places).T
+            x, y = self._pixels_at(int(frame), places).T
             inside = ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).reshape(len(rows), len(columns))
             part = np.ix_(rows, columns)
             at = [map_coordinates(looks[..., axis], (y, x), order=1, mode="nearest") for axis in range(2)]
@@ -197,39 +210,70 @@ class Made:
             count[part] += inside
         return np.where(count[..., None] > 0, total / np.maximum(count, 1)[..., None], np.nan)
 
+    def _pixels_at(self, frame: int, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the pixels (n, 2) of a frame that lie at places (n, 2) of its picture, bent as the frame is."""
+        back = np.linalg.inv(self.placed[frame])
+        pixels: NDArray[np.float64] = transform_points(back, places)
+        if self.track.control is None:
+            return pixels
+        height, width = self.truth.source.shape[1:3]
+        control = torch.from_numpy(self.track.control[frame])
+        flat, plane = self.track.scene_from_frame[frame], self.placed[frame]
+        # The picture begins where the table says that the plane nearest to the bent frame lies.
+        origin = (self._planes[frame] - plane)[:2, 2]
+        for _ in range(2):
+            inside = np.clip(pixels, 0, (width - 1, height - 1))
+            shown = basis(self.track.shape, torch.from_numpy(inside.astype(np.float32)))
+            bent = transform_points(flat, inside) + (control @ shown.T).T.double().numpy() - origin
+            pixels = transform_points(back, places - (bent - transform_points(plane, inside)))
+        return pixels
+
     def psnr_with_free_geometry(self) -> float:
         """Return PSNR of the largest piece's picture beside the object where frames look on average, dB."""
         picture, points = self.picture(), self.seen_on_average()
-        known = np.isfinite(picture) & np.isfinite(points).all(axis=-1)
+        known = self._inside(picture) & np.isfinite(points).all(axis=-1)
         return psnr(picture[known][None], self.truth.world.sample(points[known])[:, 0][None])
+
+    def _inside(self, known: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return the pixels (H, W) of a mask or a picture that lie a core distance inside what is known.
+
+        At the very rim each pixel rests on the half of one core that happens to lie there.
+        """
+        reach = 2 * round(self.truth.bundle.pitch) + 1
+        mask = known if known.dtype == bool else np.isfinite(known)
+        inside: NDArray[np.bool_] = binary_erosion(mask, np.ones((reach, reach), bool))
+        return inside
 
     def unmet(self) -> NDArray[np.float64]:
         """Return by how much each placed frame differs from its picture seen through its pose, of its contrast.
 
-        Root mean square over the pixels that are visible, and known in the picture, after a gain and offset; both
-        smoothed as vendors smooth.
+        Root mean square over the pixels that are visible, and known in the picture, a core distance inside of both,
+        after a gain and offset; both smoothed as vendors smooth.
         """
         sigma = _SHOWN * self.truth.bundle.pitch
-        smooth = {piece: _smoothed(self.picture(piece), sigma) for piece in range(int(self.piece.max()) + 1)}
-        visible = self.truth.visible
+        pictures = {piece: self.picture(piece) for piece in range(int(self.piece.max()) + 1)}
+        smooth = {
+            piece: np.where(self._inside(one), _smoothed(one, np.isfinite(one), sigma), np.nan)
+            for piece, one in pictures.items()
+        }
         height, width = self.truth.source.shape[1:3]
+        visible = np.ones((height, width), bool) if self.truth.visible is None else self.truth.visible
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(np.float64)
         found = []
         for frame in np.flatnonzero(self.piece >= 0).tolist():
-            shown = gaussian_filter(self.truth.source.values([frame])[0, ..., 0].astype(np.float64), sigma).ravel()
+            shown = _smoothed(self.truth.source.values([frame])[0, ..., 0].astype(np.float64), visible, sigma).ravel()
             x, y = transform_points(self.placed[frame], pixels).T
             seen = map_coordinates(smooth[int(self.piece[frame])], (y, x), order=1, cval=np.nan)
-            known = np.isfinite(seen) & (True if visible is None else visible.ravel())
+            known = np.isfinite(seen) & self._inside(visible).ravel()
             missed = match_levels(seen[known][None], shown[known][None])[0] - shown[known]
             found.append(float(missed.std() / shown[known].std()))
         return np.array(found)
 
 
-def _smoothed(picture: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
-    known = np.isfinite(picture)
+def _smoothed(picture: NDArray[np.float64], known: NDArray[np.bool_], sigma: float) -> NDArray[np.float64]:
     weight = gaussian_filter(known.astype(np.float64), sigma)
-    smooth = gaussian_filter(np.where(known, picture, 0), sigma) / np.maximum(weight, 1e-9)
-    return np.where(known, smooth, np.nan)
+    smooth: NDArray[np.float64] = gaussian_filter(np.where(known, picture, 0), sigma) / np.maximum(weight, 1e-9)
+    return smooth
 
 
 def _middles(matrices: NDArray[np.float64], truth: SimulatedRecording) -> NDArray[np.complex128]:
