@@ -63,4 +63,9 @@ def run(options: argparse.Namespace) -> int:
             bar.n = doing.part
             bar.refresh()
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
+    if found.resolution is not None:
+        print(f"two halves of the frames agree down to periods of {found.resolution:.1f} pixels")
+    reasons = f": {'; '.join(found.notes)}" if found.notes else ""
+    print(f"the mosaic is {found.quality}{reasons}")
+    print(f"wrote {', '.join(map(str, found.paths))} and {found.poses}")
     return 0

@@ -25,8 +25,8 @@ _SURELY_ALIKE = 0.6
 _MOST_TURN = 0.15
 # Where a mask that is interpolated is at least this, it is whole.
 _WHOLE = 0.99
-# Of so many images the spectra are kept.
-_KEPT = 256
+# Of so many images the spectra are kept: half a megabyte each, or three where a pair is looked for anywhere.
+_KEPT = 96
 
 
 Pair = tuple[int, int]

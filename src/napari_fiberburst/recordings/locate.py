@@ -3,7 +3,7 @@
 from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,6 +33,10 @@ _CALIBRATED_FROM = 48
 _ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
 # Frames bend where that lowers the error by a part of it.
 _WORTH_BENDING = 0.9
+# Frames of which the scene misses so many times the usual show something else, or are blurred.
+_MOST_MISSED = 3.0
+# Places are doubtful where more than this part of the frames has none, or the median frame is less like the scene.
+_MOST_LOST, _LEAST_ALIKE = 0.25, 0.93
 # Gains and exposures have settled after so many rounds.
 _SETTLED = 2
 # Degrees of freedom of links: frames of fewer are placed anew where they turn.
@@ -58,12 +62,15 @@ class Located:
         Where the frames lie.
     notes : tuple of str
         What a user should know.
+    quality : str
+        "good", or "doubtful" where the notes say why the places of frames may be wrong.
     """
 
     work: Work
     traces: Traces
     track: Track
     notes: tuple[str, ...]
+    quality: Literal["good", "doubtful"]
 
 
 def locating(
@@ -91,7 +98,14 @@ def locating(
     links = yield from registering(work, dof, client)
     track = _first_track(work, traces, solve_poses(links, len(traces), dof))
     track = yield from _refining(work, traces, links, track, is_free=dof is None, client=client)
-    return Located(work=work, traces=traces, track=track, notes=(*notes, *_remarks(traces, track)))
+    doubts = _doubts(traces, track)
+    return Located(
+        work=work,
+        traces=traces,
+        track=track,
+        notes=(*notes, *_remarks(traces, track), *doubts),
+        quality="doubtful" if doubts else "good",
+    )
 
 
 def _refining(
@@ -122,8 +136,11 @@ def _refining(
             unbent, track, settled = track, bending(track), 0
         else:
             break
-    is_worth = unbent is None or track.error < _WORTH_BENDING * unbent.error
-    return track if is_worth or unbent is None else unbent
+    if unbent is not None and track.error > _WORTH_BENDING * unbent.error:
+        track = unbent
+    # The weight of a frame falls with the square of what the scene misses of it.
+    belongs = track.weights > 1 / _MOST_MISSED**2
+    return replace(track, piece=np.where(belongs, track.piece, -1))
 
 
 def bundle_of(source: FrameSource, given: Bundle | None) -> tuple[Bundle, tuple[str, ...]]:
@@ -195,6 +212,21 @@ def _evened(traces: Traces, track: Track) -> Track:
     change = np.interp(np.arange(len(track)), frames, shading.exposures.numpy()).astype(np.float32)
     exposures = np.where(track.piece == 0, track.exposures * change, track.exposures)
     return replace(track, gains=gains, exposures=exposures)
+
+
+def _doubts(traces: Traces, track: Track) -> tuple[str, ...]:
+    """Return why the places of frames may be wrong."""
+    shows, placed = traces.summary.shows, track.piece >= 0
+    if not placed.any():
+        return ("no two frames show the same place",)
+    doubts = []
+    lost = float((shows & ~placed).sum() / max(1, shows.sum()))
+    if lost > _MOST_LOST:
+        doubts.append(f"{lost:.0%} of the frames that show something could not be placed")
+    alike = float(np.median(track.alike[placed]))
+    if alike < _LEAST_ALIKE:
+        doubts.append(f"frames are met by the scene with a correlation of {alike:.2f} alone; their places may be wrong")
+    return tuple(doubts)
 
 
 def _remarks(traces: Traces, track: Track) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -62,6 +62,8 @@ class Mosaic:
         Pixels, the finest period on which two halves of the frames agree; None where that is not known.
     notes : tuple of str
         What a user should know.
+    quality : str
+        "good", or "doubtful" where the notes say why the picture may be wrong.
     """
 
     paths: tuple[Path, ...]
@@ -69,6 +71,7 @@ class Mosaic:
     track: Track
     resolution: float | None
     notes: tuple[str, ...]
+    quality: Literal["good", "doubtful"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,8 +136,9 @@ def mosaicking(
     track = located.track
     if not track.pieces:
         raise BurstError(
-            f"no two frames of {source.name} show the same place; a mosaic needs frames that overlap by an eighth at "
-            "least, with something to see in them"
+            f"no two frames of {source.name} show the same place, or nothing moves in it; a mosaic needs frames of an "
+            "object that moves, which overlap by an eighth at least; a few frames of one place are a burst: fiberburst "
+            "reconstruct --frames"
         )
     told = told_by(located.traces, track, 0)
     further = (target.with_name(f"{stem}-{piece + 1}{ENDING}") for piece in range(1, track.pieces))
@@ -147,7 +151,9 @@ def mosaicking(
     write_poses(poses, track, located.work.source)
     shutil.rmtree(folder)
     resolution = None if told.agreement is None else told.agreement.resolution
-    return Mosaic(paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes)
+    return Mosaic(
+        paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes, quality=located.quality
+    )
 
 
 def check_mosaic(output: str | Path) -> Path:

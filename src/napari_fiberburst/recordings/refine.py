@@ -38,7 +38,7 @@ _LEAST_LIGHT, _MOST_GAIN = 0.05, 5.0
 # Degrees of freedom: shifts, similarities, affine transforms.
 _MODELS = (2, 4, 6)
 # A larger model is asked for where it explains the median frame better than noise would by this ratio.
-_ASKED = 8.0
+_ASKED = 4.0
 # Frames that are less like the scene than this do not belong to it.
 _LEAST_ALIKE = 0.3
 
