@@ -21,6 +21,7 @@ from napari_fiberburst.recordings.mosaic import (
     check_target,
     identity,
     poses_of,
+    traces_of,
     work_of,
     write_poses,
 )
@@ -167,9 +168,7 @@ def videoing(
     if regions is not None and not stabilised:
         check_regions(regions, source.shape[1:3], "a frame")
     folder, poses = work_of(target), poses_of(target)
-    traces, table = (
-        target.with_name(target.name.removesuffix(ENDING) + end) for end in (".traces.zarr", ".traces.csv")
-    )
+    traces, table = traces_of(target)
     claim(
         folder,
         identity(
