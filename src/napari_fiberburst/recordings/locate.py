@@ -43,7 +43,7 @@ _ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
 # Frames bend where that lowers the error by a part of it.
 _WORTH_BENDING = 0.9
 # Frames of which the scene misses so many times the usual show something else, or are blurred.
-_MOST_MISSED = 3.0
+_MOST_MISSED = 4.0
 # Places are doubtful where more than this part of the frames has none, or the median frame is less like the scene.
 _MOST_LOST, _LEAST_ALIKE = 0.25, 0.93
 # Gains and exposures have settled after so many rounds.
