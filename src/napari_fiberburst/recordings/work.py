@@ -171,7 +171,9 @@ def _there(unit: Unit, stage: str, work: Work, numbers: Sequence[int], client: A
             f"the scheduler was lost during {stage}; start it again, and give the same command again to go on"
         ) from error
     finally:
-        client.cancel([future for future in futures if not future.done()])
+        left = [future for future in futures if not future.done()]
+        if left and client.status == "running":
+            client.cancel(left)
 
 
 def _do(unit: Unit, stage: str, work: Work, number: int) -> Outcome:
