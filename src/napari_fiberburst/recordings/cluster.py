@@ -1,6 +1,7 @@
 """Workers for long recordings: processes on this machine, or a dask scheduler that is there."""
 
 import importlib.util
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -69,6 +70,10 @@ def workers(
         raise ClusterError(
             "workers need dask.distributed, which is not installed; pip install 'napari-fiberburst[cluster]'"
         )
+    import distributed  # noqa: F401, it sets its own levels
+
+    # It would tell of every worker that comes and goes.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     need = 0 if shape is None else unit_memory(shape)
     with _started(count, need) if count is not None else _joined(str(scheduler), need) as client:
         yield client
@@ -96,7 +101,7 @@ def _started(count: int, need: int) -> Iterator[Any]:
             threads_per_worker=1,
             memory_limit=max(need, MEMORY_LIMIT // count),
             dashboard_address=None,
-            silence_logs="CRITICAL",
+            silence_logs=False,
         ) as cluster,
         Client(cluster) as client,  # type: ignore[no-untyped-call]
     ):
