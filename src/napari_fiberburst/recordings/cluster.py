@@ -1,8 +1,9 @@
 """Workers for long recordings: processes on this machine, or a dask scheduler that is there."""
 
 import importlib.util
+import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from napari_fiberburst.errors import ClusterError
@@ -69,6 +70,10 @@ def workers(
         raise ClusterError(
             "workers need dask.distributed, which is not installed; pip install 'napari-fiberburst[cluster]'"
         )
+    import distributed  # noqa: F401, it sets its own levels
+
+    # It would tell of every worker that comes and goes.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     need = 0 if shape is None else unit_memory(shape)
     with _started(count, need) if count is not None else _joined(str(scheduler), need) as client:
         yield client
@@ -89,18 +94,19 @@ def _started(count: int, need: int) -> Iterator[Any]:
         )
     # What a worker holds, such as traces, can be read again from where it lies; a copy on the disk would be a third.
     kept = {"distributed.worker.memory.target": False, "distributed.worker.memory.spill": False}
-    with (
-        dask.config.set(kept),
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=count,
-            threads_per_worker=1,
-            memory_limit=max(need, MEMORY_LIMIT // count),
-            dashboard_address=None,
-            silence_logs="CRITICAL",
-        ) as cluster,
-        Client(cluster) as client,  # type: ignore[no-untyped-call]
-    ):
-        yield client
+    with dask.config.set(kept), ExitStack() as opened:
+        try:
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
+                n_workers=count,
+                threads_per_worker=1,
+                memory_limit=max(need, MEMORY_LIMIT // count),
+                dashboard_address=None,
+                silence_logs=False,
+            )
+            client = Client(opened.enter_context(cluster))  # type: ignore[no-untyped-call]
+        except (RuntimeError, OSError) as error:
+            raise ClusterError(f"workers could not be started ({error}); give the same command again") from error
+        yield opened.enter_context(client)
 
 
 @contextmanager
