@@ -5,7 +5,7 @@ import pytest
 import tifffile
 from tests.io.clips import drawn, write_clip
 
-from napari_fiberburst import Bundle, read_burst
+from napari_fiberburst import Bundle, open_recording, read_burst
 from napari_fiberburst.cli import main
 from napari_fiberburst.simulation import simulate
 
@@ -98,3 +98,28 @@ def test_a_file_that_is_no_video_is_said(tmp_path, capsys):
     (tmp_path / "a.avi").write_text("no video")
     assert main(["info", str(tmp_path / "a.avi")]) == 2
     assert "cannot be read as video" in capsys.readouterr().err
+
+
+def test_every_frame_of_a_video_is_reconstructed(tmp_path, monkeypatch, capsys, frames):
+    monkeypatch.chdir(tmp_path)
+    write_clip(tmp_path / "a.mkv", "ffv1", "gray", list(frames[:24]), group=10)
+    tifffile.imwrite("regions.tif", np.pad(np.full((20, 30), 7, np.uint8), ((30, 40), (40, 52))))
+    command = ["video", "a.mkv", "-o", "a.ome.zarr", "--window", "7", "--mp4", "a.mp4", "--regions", "regions.tif"]
+    assert main(command) == 0
+    assert "frames placed 24 of 24, each from 7" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.mkv",
+        "a.mp4",
+        "a.ome.zarr",
+        "a.poses.csv",
+        "a.traces.csv",
+        "a.traces.zarr",
+        "regions.tif",
+    ]
+    assert open_recording("a.ome.zarr").shape == (24, 90, 122, 1)
+    assert (tmp_path / "a.traces.csv").read_text().startswith("frame,seconds,region_7\n0,0.0,")
+    assert main(command) == 2
+    assert "a.ome.zarr is there already" in capsys.readouterr().err
+    (tmp_path / "no.tif").write_text("no labels")
+    assert main([*command[:3], "b.ome.zarr", "--regions", "no.tif"]) == 2
+    assert "no.tif cannot be read as a label image" in capsys.readouterr().err
