@@ -42,6 +42,7 @@ class Frames:
     def __init__(self, source: FrameSource, *, is_colour: bool = False) -> None:
         self.source = source
         count, height, width, channels = source.shape
+        self.shape: tuple[int, ...]
         if "C" not in source.acquisition.axes:
             self.axes, self.shape = "TYX", (count, height, width)
         elif is_colour:
