@@ -45,7 +45,7 @@ class PyramidLayer:
         self._levels = [zarr.open_array(path / str(level), mode="r") for level in range(count)]
         # zarr's own arrays, because dask's are kept in napari's cache, which knows nothing of tiles that come later.
         data: list[Any] = list(self._levels)
-        names = self._levels[0].metadata.dimension_names or ()
+        names = getattr(self._levels[0].metadata, "dimension_names", None) or ()
         is_colour = "c" in names and acquisition.shape[3] == 3
         if is_colour:
             data = [_as_colour(level, acquisition) for level in self._levels]

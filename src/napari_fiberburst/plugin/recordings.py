@@ -24,7 +24,9 @@ LONGEST_BURST: Final = 50
 _LOOKED_AT = 8
 
 
-def recording_layer(source: FrameSource, name: str, path: str | None = None) -> tuple[Any, dict[str, Any], str]:
+def recording_layer(
+    source: FrameSource, name: str, path: str | Sequence[str] | None = None
+) -> tuple[Any, dict[str, Any], str]:
     """Return a recording as an image layer whose frames are read when they are shown.
 
     Parameters
@@ -33,7 +35,7 @@ def recording_layer(source: FrameSource, name: str, path: str | None = None) -> 
         The recording.
     name : str
         Of the layer.
-    path : str, optional
+    path : str or sequence of str, optional
         What it was opened from.
     """
     known = source.acquisition

@@ -4,6 +4,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ class Frames:
     def __init__(self, source: FrameSource, *, is_colour: bool = False) -> None:
         self.source = source
         count, height, width, channels = source.shape
+        self.shape: tuple[int, ...]
         if "C" not in source.acquisition.axes:
             self.axes, self.shape = "TYX", (count, height, width)
         elif is_colour:
@@ -76,7 +78,9 @@ class Frames:
             return frame
         numbers = np.arange(len(self))[first].tolist()
         several = rest if rest[:1] == (...,) else (slice(None), *rest)
-        frames: NDArray[Any] = self._arranged(self.source.recorded(numbers))[several]
+        # napari asks for what it shows as a slice of one.
+        shown = self._shown(numbers[0])[None] if len(numbers) == 1 else self._arranged(self.source.recorded(numbers))
+        frames: NDArray[Any] = shown[several]
         return frames
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
@@ -90,13 +94,22 @@ class Frames:
         """Return one frame, and see to it that the next one of somebody who steps is at hand."""
         step, self._last = number - self._last, number
         frame = self._at_hand(number)
+        if frame is None and self._ahead is not None and abs(step) <= _BACK:
+            self._ahead.result()  # it may be just that
+            frame = self._at_hand(number)
         if frame is None:
             self._read(range(max(0, number - _BACK + 1), number + 1) if -_BACK <= step < 0 else [number])
             frame = self._at_hand(number)
-        if 0 < step <= _AHEAD and (self._ahead is None or self._ahead.done()):
+        coming = range(0)
+        if 0 < step <= _AHEAD:
             coming = range(number + 1, min(number + 1 + _AHEAD, len(self)))
-            if any(self._at_hand(one) is None for one in coming):
-                self._ahead = _READER.submit(self._read_quietly, coming)
+        elif -_BACK <= step < 0:
+            last = number - _BACK // 2
+            # Not before half of what is at hand has been gone through, because each read begins at a key frame.
+            coming = range(max(0, last - _BACK + 1), last + 1) if last >= 0 and self._at_hand(last) is None else coming
+        is_idle = self._ahead is None or self._ahead.done()
+        if is_idle and any(self._at_hand(one) is None for one in coming):
+            self._ahead = _READER.submit(self._read_quietly, coming, at_once=step < 0)
         if frame is None:
             raise BurstError(f"frame {number} of {self.source.name} cannot be read; check the file")
         return frame
@@ -115,13 +128,11 @@ class Frames:
             while len(self._kept) > self._most:
                 self._kept.popitem(last=False)
 
-    def _read_quietly(self, numbers: range) -> None:
+    def _read_quietly(self, numbers: range, *, at_once: bool) -> None:
         """Read ahead; what cannot be read is said when it is shown."""
-        for number in numbers:
-            try:
-                self._read([number])
-            except BurstError:
-                return
+        with suppress(BurstError):
+            for part in [numbers] if at_once else [[number] for number in numbers]:
+                self._read(part)
 
     def _arranged(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Put frames (n, H, W, C) in the order of the axes."""

@@ -191,7 +191,7 @@ def videoing(
             plan.save(located.work.shared("frames"))
         units = range(-(-len(source) // STRETCH))
         for _, left in complete(solve_unit, "frames", located.work, units, client):
-            yield Doing("solving the frames", left=left, units=len(units))
+            yield Doing("solving the frames", left=left, units=len(units), grown=target)
         write_poses(poses, plan.track, source, _pictures(plan))
         if regions is not None:
             write_table(table, traces, source.acquisition.times, source.acquisition.channel_names)

@@ -131,8 +131,8 @@ class LongTask(Task):
         except FiberBurstError as error:
             self._say_problem(str(error))
             return
-        placement, _ = Placement.of(self.input.layers, burst.axes, (0, 0)), self._forget(path)
-        self.told_of = (source, placement, path)
+        self._forget(path)
+        self.told_of = (source, Placement.of(self.input.layers, burst.axes, (0, 0)), path)
         opened_from = self.input.layers[0].metadata.get(METADATA_KEY, {}).get("recording_path")
         job = LongJob(partial(_begun, self.begin, source, opened_from, path, given, self.settings()))
         self._going.append(job)
@@ -353,8 +353,8 @@ class LongTask(Task):
         column.setContentsMargins(0, 0, 0, 0)
         column.addWidget(self.form)
         column.addLayout(row_of(self.start_button, self.pause_button, self.stop_button))
-        for widget in (self.bar, self.status, self.words):
-            column.addWidget(widget)
+        for told in (self.bar, self.status, self.words):
+            column.addWidget(told)
         column.addLayout(switches)
         self._of_result = self.card_widgets()
         for widget in self._of_result:
