@@ -17,8 +17,9 @@ Complex = NDArray[np.complex128]
 _SCALES = tuple(np.geomspace(30.0, 1.0, 12)) + (1.0,) * 4
 # A link that counts less than this in the end is false.
 _LEAST_TRUST = 0.1
-# Frames that are so much alike show the same place beyond doubt.
-_SURELY_ALIKE = 0.6
+# Frames that are so much alike show the same place beyond doubt, where they have this part of the usual in common: two
+# narrow strips are alike by chance.
+_SURELY_ALIKE, _LEAST_COMMON = 0.6, 0.25
 # Turns and zooms are believed where they lower the links' mean square error by more than this for each unknown that
 # they cost. Independent noise would lower it by one; that of links which share frames lowers it by up to four, and
 # turns of a degree by hundreds.
@@ -111,7 +112,9 @@ def pieces(links: Links, count: int) -> NDArray[np.int64]:
     A link by which frames are alike beyond doubt ties them; others do where there are two or more between the same
     pieces, because where nothing is in common some shift is always a little alike.
     """
-    sure = links.alike >= _SURELY_ALIKE
+    common = links.reach.prod(axis=1)
+    usual = float(np.median(common)) if len(links) else 0.0
+    sure = (links.alike >= _SURELY_ALIKE) & (common >= _LEAST_COMMON * usual)
     label = _tied(links.pairs[sure], count)
     while True:
         ends = np.sort(label[links.pairs[~sure]], axis=1)
@@ -151,7 +154,6 @@ class _Equations:
         alike = links.alike.clip(0, 0.999) ** 2
         self._weight = alike / (1 - alike) * reach.prod(axis=1)
         self._weight /= max(float(np.median(self._weight)), 1e-12) if len(links) else 1.0
-        self._roots = np.unique(pieces(links, count), return_index=True)[1]
 
     def solve(self, trust: NDArray[np.float64]) -> tuple[Complex, Complex]:
         """Return turns and places (T,); the first frame of each piece, and frames without links, lie as they are."""
@@ -160,31 +162,44 @@ class _Equations:
         here, there = self._here.ravel(), self._there.ravel()
         one = np.ones_like(here)
         weight = np.repeat(self._weight * trust, 4)
+        # Of those links that are believed now: a piece that only false ones tie would shrink to nothing, because all
+        # that its links miss shrinks with it.
+        piece = pieces(self._links.where(trust > _LEAST_TRUST), count)
+        roots, lone = np.unique(piece, return_index=True)[1], np.flatnonzero(piece < 0)
         places = csc_array(
             (np.concatenate([one, -one]), (np.tile(rows, 2), np.concatenate([second, first]))),
             shape=(len(rows), count),
         )
         if self._dof == 2:
-            solution = self._least_squares(places, there - here, weight, self._roots)
+            solution = self._least_squares(places, there - here, weight, roots, lone)
             return np.ones(count, complex), solution
         turns = csc_array(
             (np.concatenate([here, -there]), (np.tile(rows, 2), np.concatenate([second, first]))),
             shape=(len(rows), count),
         )
         # About 1, so that what is fixed is 0 and what little is asked of frames without links draws them there.
-        fixed = np.concatenate([self._roots, self._roots + count])
-        solution = self._least_squares(csc_array(hstack([turns, places])), there - here, weight, fixed)
+        fixed, free = (np.concatenate([some, some + count]) for some in (roots, lone))
+        solution = self._least_squares(csc_array(hstack([turns, places])), there - here, weight, fixed, free)
         return 1 + solution[:count], solution[count:]
 
     def _least_squares(
-        self, matrix: csc_array, rhs: Complex, weight: NDArray[np.float64], fixed: NDArray[np.int64]
+        self,
+        matrix: csc_array,
+        rhs: Complex,
+        weight: NDArray[np.float64],
+        fixed: NDArray[np.int64],
+        lone: NDArray[np.int64],
     ) -> Complex:
         scaled = diags_array(weight) @ matrix
         normal = matrix.conj().T @ scaled
         diagonal = normal.diagonal().real
-        # Frames without links are tied to nothing: a trace of a tie keeps the matrix regular.
-        ridge = np.full(len(diagonal), 1e-12 * max(float(diagonal.max()), 1.0))
-        ridge[fixed] = max(float(diagonal.max()), 1.0) * 1e6
+        # Frames of no piece may be tied to nothing: a trace of a tie keeps the matrix regular. Others need none, and a
+        # long chain is so weak that it would give way to one.
+        most = max(float(diagonal.max()), 1.0)
+        ridge = np.zeros(len(diagonal))
+        ridge[lone] = 1e-12 * most
+        # Nothing else holds a piece as a whole, so that any weight holds it exactly; a large one would cost digits.
+        ridge[fixed] = most
         solution: Complex = splu(csc_array(normal + diags_array(ridge))).solve(scaled.conj().T @ rhs)
         return solution
 
