@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from napari_fiberburst.recordings.links import Links, neighbours
+from napari_fiberburst.recordings.links import Linker, Links, neighbours
+from napari_fiberburst.recordings.views import Views
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +50,15 @@ def test_following_from_near_comes_to_the_same_place(turning, neighbouring):
 def test_links_are_put_together_and_chosen():
     assert len(Links.none() + Links.none()) == 0
     assert list(neighbours(np.array([3, 5, 9, 10]), [2])) == [(3, 9), (5, 10)]
+
+
+def test_frames_of_other_places_are_not_linked(hand, located):
+    linker, cut = Linker(Views(located.traces)), int(hand.cuts[0])
+    pairs = [(first, second) for first in range(4, cut, 5) for second in range(cut + 2, cut + 14, 4)]
+    # Nothing is seen in both: their middles are farther apart than a frame is wide.
+    apart = [abs(complex(*(hand.homographies[j] - hand.homographies[i])[:2, 2])) for i, j in pairs]
+    pairs = [pair for pair, distance in zip(pairs, apart, strict=True) if distance > 121]
+    assert len(pairs) > 10
+    links = linker.find(pairs)
+    assert len(links) <= 0.2 * len(pairs)
+    assert links.alike.max(initial=0) < 0.6

@@ -223,7 +223,7 @@ def test_recordings_that_make_no_mosaic(what, short, tmp_path):
     if what == "no overlap":
         path = np.tile(np.eye(3), (8, 1, 1))
         path[:, 0, 2] = 200.0 * np.arange(8)
-        source = simulate_recording(shape=SHAPE, path=path, seed=2).source
+        source = simulate_recording(shape=(61, 83), path=path, pitch=4.0, seed=2).source
     elif what == "one frame":
         source = short.source.take([0])
     elif what == "black":

@@ -21,6 +21,8 @@ _TOGETHER, _STRIDE, _STEPS = 32, 2, 5
 _ROBUST = 3.0
 # Pairs that are refined from where they are expected are not looked for elsewhere if they are so much alike there.
 _SURELY_ALIKE = 0.6
+# Of N cores in common the best shift is alike by this over the root of N where nothing is the same.
+_CHANCE = 6.0
 # A pair that has to turn (radians) or to grow by more than this, beyond what is expected, was not found.
 _MOST_TURN = 0.15
 # Where a mask that is interpolated is at least this, it is whole.
@@ -126,7 +128,7 @@ class Linker:
             How far from there the middle of a frame may lie, pixels.
         """
         links = self._refined(pairs, expected)
-        sure = (links.alike >= _SURELY_ALIKE) & links.is_near(expected, radius)
+        sure = (links.alike >= np.maximum(_SURELY_ALIKE, self._by_chance(links))) & links.is_near(expected, radius)
         open_pairs = [pair for pair, is_sure in zip(pairs, sure, strict=True) if not is_sure]
         return links.where(sure) + self._searched(open_pairs, expected[~sure], radius)
 
@@ -143,7 +145,14 @@ class Linker:
                 starts.append(start)
         at = np.reshape(np.array(starts, dtype=np.float64), (-1, 4))
         links = self._refined(kept, at)
-        return links.where((links.alike >= LEAST_ALIKE) & links.is_near(at, self._half * self._views.spacing / 4))
+        is_alike = links.alike >= np.maximum(LEAST_ALIKE, self._by_chance(links))
+        return links.where(is_alike & links.is_near(at, self._half * self._views.spacing / 4))
+
+    def _by_chance(self, links: Links) -> NDArray[np.float64]:
+        """Return how alike what each pair has in common may be by chance, (L,): the fewer cores, the more."""
+        cores = 12 * links.reach.prod(axis=1) / self._views.pitch**2  # an even square has its side over root 12 as rms
+        alike: NDArray[np.float64] = _CHANCE / np.sqrt(np.maximum(cores, 1))
+        return alike
 
     def _refined(self, pairs: Sequence[Pair], starts: NDArray[np.float64]) -> Links:
         found = Links.none()

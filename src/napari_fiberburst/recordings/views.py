@@ -44,11 +44,14 @@ class Views:
         Pixels of the frame to a cell.
     shape : (int, int)
         h and w.
+    pitch : float
+        Distance of neighbouring cores, pixels of the frame.
     """
 
     def __init__(self, traces: Traces) -> None:
         self._traces = traces
         template = traces.template
+        self.pitch = template.pitch
         self._grid = grid_of(template.shape, template.pitch)
         self.spacing, self.shape = self._grid.spacing, self._grid.shape
         mean = traces.summary.mean_light
