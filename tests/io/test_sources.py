@@ -239,7 +239,7 @@ class Broken:
         (np.zeros((3, 20, 30, 3, 2)), "got shape"),
         (Broken(), r"frames 0 to 0 of the array cannot be read \(KeyError: 'the disk is gone'\)"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 def test_what_is_no_recording_is_refused(recording, said):
     with pytest.raises(BurstError, match=said):
