@@ -11,9 +11,8 @@ import numpy as np
 import zarr
 from PIL import Image
 
-from napari_fiberburst import open_recording
+from napari_fiberburst import mosaic, open_recording
 from napari_fiberburst.io.video_writer import write_video
-from napari_fiberburst.recordings.mosaic import mosaic
 from napari_fiberburst.simulation import simulate_recording
 
 tiny = os.environ.get("FIBERBURST_EXAMPLE_SCALE") == "tiny"
@@ -27,7 +26,8 @@ with tempfile.TemporaryDirectory() as folder:
     made = mosaic(source, Path(folder, "wide.ome.zarr"))
     picture = np.asarray(zarr.open_array(made.paths[0] / "0", mode="r")) / 255
     print(f"{frames} frames of {side} x {side} make {picture.shape[0]} x {picture.shape[1]} pixels; {made.quality}")
-    print(*made.notes, sep="\n")
+    for note in made.notes:
+        print(note)
     frame = source.values([frames // 2])[0, ..., 0]
 
 low, high = np.nanpercentile(picture, [0.5, 99.5])
