@@ -86,7 +86,7 @@ def test_other_work_is_refused_and_the_difference_is_named(tmp_path):
     folder = tmp_path / "m.work"
     assert not claim(folder, {"recording": "a", "dof": 2})
     assert claim(folder, {"recording": "a", "dof": 2})
-    with pytest.raises(OutputError, match=r"\(dof was 2, is 4\); go on with the same settings .* --fresh"):
+    with pytest.raises(OutputError, match=r"\(dof was 2, is 4\); go on with the same settings .*--fresh"):
         claim(folder, {"recording": "a", "dof": 4})
 
 
