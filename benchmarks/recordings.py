@@ -351,7 +351,7 @@ def places(name: str, made: Made, median: float | None, worst: float | None) -> 
     return [
         Row(case=name, what="places of frames, median", found=float(np.median(missed)), goal=median, unit="px"),
         Row(case=name, what="places of frames, worst", found=float(missed.max()), goal=worst, unit="px"),
-        Row(case=name, what="frames not in the mosaic", found=len(made.piece) - len(missed)),
+        Row(case=name, what="frames not in the largest piece", found=len(made.piece) - len(missed)),
     ]
 
 
