@@ -2,9 +2,11 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +115,16 @@ def test_a_scheduler_that_is_not_there_is_said_soon(address, monkeypatch):
 def test_a_scheduler_that_is_there_is_joined(client, work):
     with cluster.workers(scheduler=client.scheduler.address, shape=(40, 97, 121, 1)) as joined:
         assert list(complete(tell, "some", work, [0], joined)) == [(0, 0)]
+
+
+def test_another_cluster_on_this_machine_is_not_in_the_way(work):
+    with socket.socket() as taken:
+        # The port of every cluster's dashboard; perhaps another program holds it already.
+        with suppress(OSError):
+            taken.bind(("127.0.0.1", 8787))
+            taken.listen()
+        with cluster.workers(1) as client:
+            assert list(complete(tell, "some", work, [0], client)) == [(0, 0)]
 
 
 class Elsewhere:

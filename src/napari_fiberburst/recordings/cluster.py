@@ -100,7 +100,8 @@ def _started(count: int, need: int) -> Iterator[Any]:
                 n_workers=count,
                 threads_per_worker=1,
                 memory_limit=max(need, MEMORY_LIMIT // count),
-                dashboard_address=None,
+                # Without a dashboard its port is asked for all the same, and two commands at once would both want 8787.
+                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                 silence_logs=False,
             )
             client = Client(opened.enter_context(cluster))  # type: ignore[no-untyped-call]
