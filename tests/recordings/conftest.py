@@ -10,7 +10,8 @@ from napari_fiberburst.io import open_recording
 from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.recordings.links import Linker
 from napari_fiberburst.recordings.locate import bundle_of, locating
-from napari_fiberburst.recordings.mosaic import identity, mosaic
+from napari_fiberburst.recordings.mosaic import mosaic
+from napari_fiberburst.recordings.outputs import identity
 from napari_fiberburst.recordings.traces import traced, tracing
 from napari_fiberburst.recordings.views import Views, middle_of
 from napari_fiberburst.recordings.work import Work, claim

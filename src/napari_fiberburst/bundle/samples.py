@@ -24,6 +24,8 @@ _LEAST_TRANSMISSION = 0.2
 SATURATED = 0.998
 # Frames that vary less than this part of the median frame are black, white or empty in another way.
 _LEAST_CONTRAST_OF_USUAL = 0.2
+# A frame with at least this part of its pixels over-exposed is white.
+_MOST_GLARE = 0.5
 # A core counts at most as much as this many typical ones, and not at all below this part of one.
 _MOST_WEIGHT, _LEAST_WEIGHT = 3.0, 0.02
 # Part of the detail predicted inside cores that must be there to count as real.
@@ -169,12 +171,21 @@ def in_grey(frames: Tensor) -> Tensor:
     return total / frames.shape[-1]
 
 
+def contrast_and_glare(frames: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the standard deviation of each frame (T, H, W), (T,), and the part of it that is over-exposed, (T,)."""
+    # One by one, because what this makes of a frame is as large as it is.
+    contrast = torch.stack([steady.mean((frame - steady.mean(frame)).square()).sqrt() for frame in frames])
+    return contrast, torch.stack([(frame >= SATURATED).sum() / frame.numel() for frame in frames])
+
+
+def shows_something(contrast: Tensor, glare: Tensor) -> Tensor:
+    """Return which frames are not black, white or even (T,), by `contrast_and_glare` of all of them."""
+    return (contrast > _LEAST_CONTRAST_OF_USUAL * contrast.median()) & (glare < _MOST_GLARE)
+
+
 def exposed(frames: Tensor) -> Tensor:
     """Return which frames (T, H, W) show something: not all black, white or even; all of them where none does."""
-    # One by one, because what this makes of a frame is as large as it is.
-    deviation = torch.stack([steady.mean((frame - steady.mean(frame)).square()).sqrt() for frame in frames])
-    bright = torch.stack([(frame >= SATURATED).sum() / frame.numel() for frame in frames])
-    good = (deviation > _LEAST_CONTRAST_OF_USUAL * deviation.median()) & (bright < 0.5)
+    good = shows_something(*contrast_and_glare(frames))
     return good if bool(good.any()) else torch.ones_like(good)
 
 

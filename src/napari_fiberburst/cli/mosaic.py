@@ -2,16 +2,15 @@
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from napari_fiberburst.cli.work import add_work, clear, worked
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.io import open_recording
+from napari_fiberburst.settings.freedom import FREEDOM
 
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
-
-MOTIONS: Final = {"auto": None, "translation": 2, "similarity": 4}
 
 
 def add_to(commands: Any) -> None:
@@ -35,7 +34,7 @@ def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
     parser.add_argument("--bundle", type=Path, help="probe.bundle, or an image of the bundle in even light")
     parser.add_argument(
         "--motion",
-        choices=tuple(MOTIONS),
+        choices=tuple(FREEDOM),
         default="auto",
         help="how frames may lie: shifted, or turned and grown as well; default, as they ask for",
     )
@@ -55,7 +54,8 @@ def opened(options: argparse.Namespace) -> tuple[FrameSource, "Bundle | None"]:
 def run(options: argparse.Namespace) -> int:
     """Make the mosaic and say what has come of it."""
     # torch takes seconds to load
-    from napari_fiberburst.recordings.mosaic import check_target, mosaicking
+    from napari_fiberburst.recordings.mosaic import mosaicking
+    from napari_fiberburst.recordings.outputs import check_target
 
     clear(options)
     check_target(options.output, "mosaic")
@@ -63,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
     found = worked(
         options,
         source.shape,
-        lambda client: mosaicking(source, options.output, bundle=bundle, dof=MOTIONS[options.motion], client=client),
+        lambda client: mosaicking(source, options.output, bundle=bundle, dof=FREEDOM[options.motion], client=client),
     )
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
     if found.resolution is not None:

@@ -8,9 +8,10 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from napari_fiberburst.cli.mosaic import MOTIONS, add_recording, opened
+from napari_fiberburst.cli.mosaic import add_recording, opened
 from napari_fiberburst.cli.work import clear, worked
 from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.settings.freedom import FREEDOM
 
 
 def add_to(commands: Any) -> None:
@@ -48,7 +49,7 @@ def add_to(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Make the video and say what has come of it."""
     # torch takes seconds to load
-    from napari_fiberburst.recordings.mosaic import check_target
+    from napari_fiberburst.recordings.outputs import check_target
     from napari_fiberburst.recordings.video import videoing
 
     clear(options)
@@ -62,7 +63,7 @@ def run(options: argparse.Namespace) -> int:
             source,
             options.output,
             bundle=bundle,
-            dof=MOTIONS[options.motion],
+            dof=FREEDOM[options.motion],
             window=options.window,
             stabilised=options.stabilised,
             regions=regions,

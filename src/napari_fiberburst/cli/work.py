@@ -44,7 +44,7 @@ def clear(options: argparse.Namespace) -> None:
     OutputError
         What would be replaced is the recording, or no picture of ours.
     """
-    from napari_fiberburst.recordings.mosaic import ENDING, outputs_of, work_of
+    from napari_fiberburst.recordings.outputs import ENDING, outputs_of, work_of
     from napari_fiberburst.recordings.work import discard, is_begun, remove
 
     output, folder = options.output.resolve(), work_of(options.output.resolve())

@@ -28,15 +28,15 @@ class _Codec:
 
     Attributes
     ----------
-    library : str
-        ffmpeg's name of the encoder.
+    encoder : str
+        As ffmpeg names it.
     options : dict
         The encoder's own.
     layouts : dict
         By number of channels and bytes of a value: the layout that frames are encoded in.
     """
 
-    library: str
+    encoder: str
     options: dict[str, str]
     layouts: dict[tuple[int, int], str]
 
@@ -44,18 +44,18 @@ class _Codec:
 _CODECS = {
     # Version 3 is what splits a frame, so that several processors can decode it.
     "ffv1": _Codec(
-        library="ffv1",
+        encoder="ffv1",
         options={"level": "3", "g": "1"},
         layouts={(1, 1): "gray", (3, 1): "bgr0", (1, 2): "gray16le", (3, 2): "rgb48le"},
     ),
     # A quality of 2 is the best that the encoder has; it counts in units of 118.
     "mjpeg": _Codec(
-        library="mjpeg",
+        encoder="mjpeg",
         options={"flags": "+qscale", "global_quality": str(2 * 118)},
         layouts={(1, 1): "yuvj444p", (3, 1): "yuvj444p"},
     ),
     "h264": _Codec(
-        library="libx264", options={"crf": "17", "preset": "fast"}, layouts={(1, 1): "yuv420p", (3, 1): "yuv420p"}
+        encoder="libx264", options={"crf": "17", "preset": "fast"}, layouts={(1, 1): "yuv420p", (3, 1): "yuv420p"}
     ),
 }
 # Layouts of arrays, by number of channels and bytes of a value.
@@ -184,7 +184,7 @@ def _encode(output: Any, source: FrameSource, codec: _Codec, shown: "_Times", on
     depth = 2 if (channels, 2) in codec.layouts and source.acquisition.dtype.itemsize > 1 else 1
     even = 2 if codec.layouts[channels, depth] == "yuv420p" else 1
     stream = output.add_stream(
-        codec.library,
+        codec.encoder,
         rate=shown.rate,
         options=codec.options,
         width=-(-width // even) * even,

@@ -25,17 +25,18 @@ from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.io.zarr import is_zarr
 from napari_fiberburst.pipeline.choose import best_burst
 from napari_fiberburst.pipeline.reconstruct import as_bundle, reconstruct
-from napari_fiberburst.recordings.mosaic import identity, mosaicking
+from napari_fiberburst.recordings.mosaic import mosaicking
+from napari_fiberburst.recordings.outputs import identity
 from napari_fiberburst.recordings.work import Doing, claim, room
 from napari_fiberburst.results.batch import Row
 from napari_fiberburst.settings import choose
+from napari_fiberburst.settings.freedom import FREEDOM
 
 _ENDINGS = (*TIFF_ENDINGS, *VIDEO_ENDINGS, *ARCHIVE_ENDINGS)
 # Longer side of a thumbnail, pixels.
 _THUMBNAIL = 192
 # A mosaic of more than this part of the frames that show something is good; of less than that, bad.
 _MOST_PLACED, _LEAST_PLACED = 0.9, 0.5
-_MOTIONS = {"auto": None, "translation": 2, "similarity": 4}
 # What one recording alone can fail by; others go on.
 _FAILURES = (ValueError, OSError, RuntimeError, LookupError, ArithmeticError, MemoryError)
 
@@ -56,7 +57,7 @@ class Made:
 def _mosaic(
     source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
 ) -> Generator[Doing, None, Made]:
-    dof = _MOTIONS[settings.get("motion", "auto")]
+    dof = FREEDOM[settings.get("motion", "auto")]
     made = yield from mosaicking(source, folder / "mosaic.ome.zarr", bundle=bundle, dof=dof, client=client)
     placed, count = int((made.track.piece == 0).sum()), len(made.track)
     part = placed / count
@@ -96,8 +97,8 @@ def _check_mosaic(settings: Settings) -> None:
     for name in settings:
         if name != "motion":
             raise SettingsError(f"{name} is no setting of a mosaic; known ones are bundle and motion")
-    if settings.get("motion", "auto") not in _MOTIONS:
-        raise SettingsError(f"motion must be one of {', '.join(_MOTIONS)}; got {settings['motion']!r}")
+    if settings.get("motion", "auto") not in FREEDOM:
+        raise SettingsError(f"motion must be one of {', '.join(FREEDOM)}; got {settings['motion']!r}")
 
 
 def _check_burst(settings: Settings) -> None:

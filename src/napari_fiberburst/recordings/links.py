@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.motion.correlation import OverlapCorrelation
+from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.views import Views
 from napari_fiberburst.stored import Stored
 
@@ -100,16 +101,16 @@ class Linker:
     def __init__(self, views: Views) -> None:
         self._views = views
         self._correlation = OverlapCorrelation(views.at, views.shape, _KEPT)
-        rows, columns = views.shape
+        height, width = views.shape
         # Steps are told in halves of the longer side, so that a turn and a shift of one unit are alike.
-        self._half = max(rows, columns) / 2
+        self._half = max(height, width) / 2
         y, x = torch.meshgrid(
-            (torch.arange(0, rows, _STRIDE) - (rows - 1) / 2) / self._half,
-            (torch.arange(0, columns, _STRIDE) - (columns - 1) / 2) / self._half,
+            (torch.arange(0, height, _STRIDE) - (height - 1) / 2) / self._half,
+            (torch.arange(0, width, _STRIDE) - (width - 1) / 2) / self._half,
             indexing="ij",
         )
         self._x, self._y = x.reshape(-1), y.reshape(-1)
-        self._scale = torch.tensor([(columns - 1) / 2, (rows - 1) / 2]) / self._half
+        self._scale = torch.tensor([(width - 1) / 2, (height - 1) / 2]) / self._half
 
     def find(self, pairs: Sequence[Pair]) -> Links:
         """Return those of pairs that show the same place, wherever that is."""
@@ -174,8 +175,8 @@ class Linker:
         for _ in range(_STEPS):
             there, mask = self._sampled(first, similarity)
             weight = inside * (mask > _WHOLE)
-            residual = _of_mean(there, weight) - _of_mean(moving, weight)
-            robust = weight / (1 + (residual / (_ROBUST * _typical(residual, weight))).square())
+            residual = (there - rows.mean(there, weight)) - (moving - rows.mean(moving, weight))
+            robust = weight / (1 + (residual / (_ROBUST * rows.rms(residual, weight))).square())
             weighted = jacobian * robust[:, None]
             normal = weighted @ jacobian.mT + 1e-3 * torch.eye(4)
             change = torch.linalg.solve(normal, (weighted @ residual[..., None]))[..., 0]
@@ -190,7 +191,7 @@ class Linker:
             similarity=similarity.double().numpy() * unit,
             middle=middle.double().numpy() * unit[2:],
             reach=spread.clamp_min(0).sqrt().double().numpy() * unit[2:],
-            alike=np.nan_to_num(_correlation(there, moving, weight).double().numpy()),
+            alike=rows.correlation(there, moving, weight).double().numpy(),
         )
 
     def _stacked(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
@@ -224,22 +225,6 @@ def _composed(similarity: Tensor, change: Tensor) -> Tensor:
     turn = turn / grown
     place = place - turn * shift
     return torch.stack([turn.real, turn.imag, place.real, place.imag], dim=1)
-
-
-def _of_mean(values: Tensor, weight: Tensor) -> Tensor:
-    return values - (values * weight).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-9)
-
-
-def _typical(residual: Tensor, weight: Tensor) -> Tensor:
-    """Return the root of the weighted mean square of residuals (B, P), (B, 1)."""
-    square = (residual.square() * weight).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True).clamp_min(1e-9)
-    return square.sqrt().clamp_min(1e-6)
-
-
-def _correlation(first: Tensor, second: Tensor, weight: Tensor) -> Tensor:
-    first, second = _of_mean(first, weight), _of_mean(second, weight)
-    power = (weight * first.square()).sum(dim=1) * (weight * second.square()).sum(dim=1)
-    return (weight * first * second).sum(dim=1) / power.sqrt().clamp_min(1e-9)
 
 
 def neighbours(frames: NDArray[np.int64], gaps: Sequence[int]) -> Iterator[Pair]:

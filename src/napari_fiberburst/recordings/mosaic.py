@@ -1,11 +1,8 @@
 """One wide picture of a long recording, solved tile by tile."""
 
-import csv
-import io
 import math
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -19,23 +16,29 @@ from torch import Tensor
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.coordinates import transform_points
 from napari_fiberburst.data.source import FrameSource
-from napari_fiberburst.errors import BurstError, OutputError
+from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.pyramid import CHUNK, coarsen, create_pyramid, write_tile
-from napari_fiberburst.io.results import check_place, write_whole
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
+from napari_fiberburst.recordings.outputs import (
+    ENDING,
+    OME_UNITS,
+    check_target,
+    identity,
+    piece_of,
+    poses_of,
+    work_of,
+    write_poses,
+)
 from napari_fiberburst.recordings.scene import equations, told_by
 from napari_fiberburst.recordings.tiles import Tile, picture_of, pieces_tiled
 from napari_fiberburst.recordings.traces import traced
 from napari_fiberburst.recordings.track import Track
-from napari_fiberburst.recordings.work import Doing, Work, claim, complete, finish, is_begun, own, room
+from napari_fiberburst.recordings.work import Doing, Work, claim, complete, finish, own, room
 from napari_fiberburst.scene.spline import NormalEquations
 from napari_fiberburst.steps import drain
 from napari_fiberburst.stored import Stored
 
-ENDING = ".ome.zarr"
-# Units of length as OME-NGFF names them.
-OME_UNITS = {"µm": "micrometer", "nm": "nanometer", "mm": "millimeter"}
 # Nodes to a side of a tile, whole chunks; and nodes about it, in pitches: farther than that a scene does not reach.
 _SIDE, _HALO = 2 * CHUNK, 8.0
 # Iterations of a first scene, by which samples that show something else are told.
@@ -149,9 +152,10 @@ def _made(
             "reconstruct --frames"
         )
     told = told_by(located.traces, track, 0)
-    paths = tuple(_piece_of(target, piece) for piece in range(track.pieces))
+    paths = tuple(piece_of(target, piece) for piece in range(track.pieces))
     own(folder, paths)
     yield from _draw(located, paths, told.smoothness, client)
+    # The picture too, though each tile was coarsened once it was drawn: a run may have been cut short between the two.
     for path in paths:
         for part in (path, *(path / name for name in _FURTHER)):
             coarsen(part)
@@ -162,66 +166,6 @@ def _made(
     return Mosaic(
         paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes, quality=located.quality
     )
-
-
-def check_target(output: str | Path, what: str) -> Path:
-    """Refuse a path that a mosaic or a video cannot be written to, before long work rather than after it.
-
-    Raises
-    ------
-    OutputError
-        It has another ending, is there already, or its folder cannot be written.
-    """
-    target = Path(output).resolve()  # workers may have another current folder
-    if not target.name.endswith(ENDING):
-        raise OutputError(f"a {what} is written to a folder ending in {ENDING}; got {output}")
-    poses = poses_of(target)
-    for path in (target, poses):
-        if path.exists() and not is_begun(work_of(target)):
-            raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
-    check_place(poses)
-    return target
-
-
-def work_of(output: Path) -> Path:
-    """Return the folder of the work on an output."""
-    return output.with_name(output.name.removesuffix(ENDING) + ".work")
-
-
-def outputs_of(output: Path) -> list[Path]:
-    """Return what a finished mosaic or video has written: the table of places, by which pieces are known, and these."""
-    poses = poses_of(output)
-    if not poses.exists():
-        return [output]
-    with poses.open(newline="", encoding="utf-8") as table:
-        pieces = {int(row["piece"]) for row in csv.DictReader(table) if row["piece"]}
-    return [_piece_of(output, piece) for piece in sorted({0, *pieces})] + [poses, *traces_of(output)]
-
-
-def poses_of(output: Path) -> Path:
-    """Return the table of places beside an output."""
-    return output.with_name(output.name.removesuffix(ENDING) + ".poses.csv")
-
-
-def traces_of(output: Path) -> tuple[Path, Path]:
-    """Return the traces beside a video, of cores and of regions."""
-    zarr, table = (output.with_name(output.name.removesuffix(ENDING) + end) for end in (".traces.zarr", ".traces.csv"))
-    return zarr, table
-
-
-def _piece_of(output: Path, piece: int) -> Path:
-    stem = output.name.removesuffix(ENDING)
-    return output if piece == 0 else output.with_name(f"{stem}-{piece + 1}{ENDING}")
-
-
-def identity(source: FrameSource, *, bundle: Bundle | None, **settings: Any) -> dict[str, Any]:
-    """Return what work on a recording is told by, as plain values."""
-    return {
-        "recording": source.fingerprint,
-        "bundle": None if bundle is None else bundle.digest(),
-        "version": version("napari-fiberburst"),
-        **settings,
-    }
 
 
 def _draw(
@@ -303,25 +247,3 @@ def _frames_behind(track: Track, frames: NDArray[np.int64], grid: Grid, bundle: 
         ImageDraw.Draw(looked).polygon([(x, y) for x, y in places.tolist()], fill=1)
         count += np.asarray(looked)
     return torch.from_numpy(count)
-
-
-def write_poses(path: Path, track: Track, source: FrameSource, pictures: Mapping[int, Grid]) -> None:
-    """Write where frames lie as CSV: frame, seconds, piece, used, and h00 to h22.
-
-    The matrix leads from frame pixels to pixels of the picture of the frame's piece, (x, y), integers at pixel centres.
-    Frames of pieces that have no picture are not used.
-    """
-    times = source.acquisition.times
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["frame", "seconds", "piece", "used", *(f"h{i}{j}" for i in range(3) for j in range(3))])
-    for number, (matrix, piece) in enumerate(zip(track.planes(), track.piece, strict=True)):
-        seconds = "" if times is None else repr(float(times[number]))
-        if piece not in pictures:
-            writer.writerow([number, seconds, "", 0, *[""] * 9])
-            continue
-        grid = pictures[int(piece)]
-        placed = np.array([[1, 0, -grid.x0], [0, 1, -grid.y0], [0, 0, 1]]) @ matrix
-        writer.writerow([number, seconds, int(piece), 1, *(repr(float(value)) for value in placed.ravel())])
-    with write_whole(path) as stream:
-        stream.write(text.getvalue().encode())

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.operators.grid import Grid, Sampling
+from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.bending import Bend, basis, control_grid
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
 from napari_fiberburst.recordings.tiles import pieces_tiled
@@ -130,7 +131,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     weights = samples.weights * sampling.inside
     light, along_x, along_y = sampling.with_slopes(filtered.mean(dim=0))
     residual = samples.grey - light
-    typical = (_sums(weights, residual.square()) / weights.sum(dim=1).clamp_min(1e-9)).sqrt().clamp_min(1e-6)
+    typical = rows.rms(residual, weights)[:, 0]
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
     slopes = along_x, along_y
     exposures, matrices, asked, left = _stepped(track, frames, points, robust, residual, light, slopes)
@@ -149,7 +150,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
         control=None if control is None else control.numpy(),
         exposures=exposures,
         missed=typical.double().numpy(),
-        alike=_correlation(samples.grey, light, weights).double().numpy(),
+        alike=rows.correlation(samples.grey, light, weights).double().numpy(),
         asked=asked / typical.double().numpy()[:, None] ** 2,
         bending=told,
         agreement=agreement,
@@ -268,15 +269,3 @@ def larger_model(track: Track, parts: list[Refinement]) -> int:
     step = _MODELS.index(track.dof)
     asked = np.concatenate([part.asked for part in parts])[:, step]
     return _MODELS[step + 1] if len(asked) and np.median(asked) > _ASKED else track.dof
-
-
-def _sums(weights: Tensor, values: Tensor) -> Tensor:
-    return (weights * values).sum(dim=1)
-
-
-def _correlation(first: Tensor, second: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted correlation of rows (n, N), (n,); 0 where there is nothing to compare."""
-    mass = weights.sum(dim=1).clamp_min(1e-9)[:, None]
-    first, second = (part - _sums(weights, part)[:, None] / mass for part in (first, second))
-    power = _sums(weights, first.square()) * _sums(weights, second.square())
-    return torch.where(power > 0, _sums(weights, first * second) / power.clamp_min(1e-20).sqrt(), 0.0)

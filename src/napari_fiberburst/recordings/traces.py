@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.bundle.samples import SATURATED, Samples, in_grey, sample_cores
+from napari_fiberburst.bundle.samples import Samples, contrast_and_glare, in_grey, sample_cores, shows_something
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.recordings.work import Doing, Work, complete
 from napari_fiberburst.stored import Stored
@@ -22,10 +22,6 @@ TRACES = "traces"
 PART = 64
 # So many parts are kept in memory.
 KEPT_PARTS = 32
-# Frames that vary less than this part of the median frame are black, white or empty in another way.
-_LEAST_CONTRAST_OF_USUAL = 0.2
-# A frame with more than this part of its pixels over-exposed is white.
-_MOST_BRIGHT = 0.5
 # Bytes of frames that are looked at together.
 _BYTES_TOGETHER = 2**26
 
@@ -42,7 +38,7 @@ class TracePart(Stored):
         (n, N), as those of `Samples`.
     contrast : Tensor
         (n,), standard deviation of each frame's pixels, full scale 1.
-    bright : Tensor
+    glare : Tensor
         (n,), part of each frame's pixels that are over-exposed.
     """
 
@@ -51,7 +47,7 @@ class TracePart(Stored):
     values: Tensor
     weights: Tensor
     contrast: Tensor
-    bright: Tensor
+    glare: Tensor
 
 
 def trace_part(source: FrameSource, bundle: Bundle, number: int) -> TracePart:
@@ -62,11 +58,10 @@ def trace_part(source: FrameSource, bundle: Bundle, number: int) -> TracePart:
     found = []
     for start in range(first, last, together):
         frames = torch.from_numpy(source.values(range(start, min(start + together, last))))
-        samples, grey = sample_cores(frames, bundle, source.acquisition), in_grey(frames)
-        contrast, bright = grey.std(dim=(1, 2)), (grey >= SATURATED).float().mean(dim=(1, 2))
-        found.append((samples.values, samples.weights, contrast, bright))
-    values, weights, contrast, bright = (torch.cat(part) for part in zip(*found, strict=True))
-    return TracePart(values=values, weights=weights, contrast=contrast, bright=bright)
+        samples = sample_cores(frames, bundle, source.acquisition)
+        found.append((samples.values, samples.weights, *contrast_and_glare(in_grey(frames))))
+    values, weights, contrast, glare = (torch.cat(part) for part in zip(*found, strict=True))
+    return TracePart(values=values, weights=weights, contrast=contrast, glare=glare)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,7 +70,7 @@ class Summary(Stored):
 
     Attributes
     ----------
-    contrast, bright : Tensor
+    contrast, glare : Tensor
         (T,), as those of `TracePart`.
     mean_light : Tensor
         (N,), the mean of what each core has seen, grey.
@@ -84,7 +79,7 @@ class Summary(Stored):
     _kind: ClassVar[str] = "summary of traces"
 
     contrast: Tensor
-    bright: Tensor
+    glare: Tensor
     mean_light: Tensor
 
     @classmethod
@@ -93,23 +88,19 @@ class Summary(Stored):
         told: list[tuple[Tensor, Tensor]] = []
         total = mass = torch.zeros(())
         for part in parts:
-            told.append((part.contrast, part.bright))
-            shows = _shows(part.contrast, part.bright, float(part.contrast.median()))
+            told.append((part.contrast, part.glare))
+            shows = shows_something(part.contrast, part.glare)
             weights = part.weights * shows[:, None]
             total = total + (part.values.mean(dim=2) * weights).sum(dim=0)
             mass = mass + weights.sum(dim=0)
-        contrast, bright = (torch.cat(one) for one in zip(*told, strict=True))
-        return cls(contrast=contrast, bright=bright, mean_light=total / mass.clamp_min(1e-9))
+        contrast, glare = (torch.cat(one) for one in zip(*told, strict=True))
+        return cls(contrast=contrast, glare=glare, mean_light=total / mass.clamp_min(1e-9))
 
     @property
     def shows(self) -> NDArray[np.bool_]:
         """(T,) bool, frames that show something: not all black, white or even."""
-        shown: NDArray[np.bool_] = _shows(self.contrast, self.bright, float(self.contrast.median())).numpy()
+        shown: NDArray[np.bool_] = shows_something(self.contrast, self.glare).numpy()
         return shown
-
-
-def _shows(contrast: Tensor, bright: Tensor, usual: float) -> Tensor:
-    return (contrast > _LEAST_CONTRAST_OF_USUAL * usual) & (bright < _MOST_BRIGHT)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -170,12 +161,8 @@ def tracing(work: Work, client: Any | None) -> Generator[Doing, None, Traces]:
     return traced(work)
 
 
+@lru_cache(maxsize=2)
 def traced(work: Work) -> Traces:
     """Return the traces that units have left; in one process they share what is in memory."""
-    return _opened(work)
-
-
-@lru_cache(maxsize=2)
-def _opened(work: Work) -> Traces:
     summary = Summary.load(work.shared(TRACES))
     return Traces.of(work.source, work.bundle, summary, lambda number: TracePart.load(work.path(TRACES, number)))

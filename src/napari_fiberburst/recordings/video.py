@@ -15,7 +15,8 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io.pyramid import create_pyramid
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
-from napari_fiberburst.recordings.mosaic import (
+from napari_fiberburst.recordings.movie import check_movie, write_movie
+from napari_fiberburst.recordings.outputs import (
     ENDING,
     OME_UNITS,
     check_target,
@@ -25,7 +26,6 @@ from napari_fiberburst.recordings.mosaic import (
     work_of,
     write_poses,
 )
-from napari_fiberburst.recordings.movie import check_movie, write_movie
 from napari_fiberburst.recordings.regions import check_regions, create_traces, numbers_of, write_table
 from napari_fiberburst.recordings.smoothness import smoothness_for
 from napari_fiberburst.recordings.stretch import STRETCH, Plan, solve_unit
@@ -167,8 +167,7 @@ def videoing(
         raise SettingsError(f"window must be a number of frames, at least 1; got {window!r}")
     if regions is not None and not stabilised:
         check_regions(regions, source.shape[1:3], "a frame")
-    folder, poses = work_of(target), poses_of(target)
-    traces, table = traces_of(target)
+    folder = work_of(target)
     claim(
         folder,
         identity(
@@ -182,40 +181,52 @@ def videoing(
         ),
     )
     with room(folder):
-        own(folder, [target, poses, traces, table])
+        own(folder, [target, poses_of(target), *traces_of(target)])
         located = yield from locating(source, folder, bundle=bundle, dof=dof, client=client)
-        plan = _planned(located, target, traces, window, stabilised, regions)
-        located.work.begin("frames")
-        if not located.work.shared("frames").exists():  # frames that are solved already stay
-            _create(plan, located)
-            plan.save(located.work.shared("frames"))
-        units = range(-(-len(source) // STRETCH))
-        for _, left in complete(solve_unit, "frames", located.work, units, client):
-            yield Doing("solving the frames", left=left, units=len(units), grown=target)
-        write_poses(poses, plan.track, source, _pictures(plan))
-        if regions is not None:
-            write_table(table, traces, source.acquisition.times, source.acquisition.channel_names)
-        movie = None
+        plan = _planned(located, target, window, stabilised, regions)
+        yield from _solve(plan, located, target, client)
+        made = _written(plan, located, target)
         if mp4 is not None:
             yield Doing("writing the film", left=1)
             movie = write_movie(target, Path(mp4), source.acquisition, scale_bar=scale_bar)
+            made = replace(made, movie=movie)
         finish(folder)
-        return Video(
-            path=target,
-            poses=poses,
-            traces=traces,
-            table=None if regions is None else table,
-            movie=movie,
-            track=plan.track,
-            window=plan.window,
-            notes=(*located.notes, *_remarks(plan)),
-        )
+        return made
+
+
+def _solve(plan: Plan, located: Located, target: Path, client: Any | None) -> Generator[Doing, None, None]:
+    work = located.work
+    work.begin("frames")
+    if not work.shared("frames").exists():  # frames that are solved already stay
+        _create(plan, located)
+        plan.save(work.shared("frames"))
+    units = range(-(-len(work.source) // STRETCH))
+    for _, left in complete(solve_unit, "frames", work, units, client):
+        yield Doing("solving the frames", left=left, units=len(units), grown=target)
+
+
+def _written(plan: Plan, located: Located, target: Path) -> Video:
+    """Write the tables beside a video that is solved, and return what there is."""
+    source = located.work.source
+    poses, (traces, table) = poses_of(target), traces_of(target)
+    write_poses(poses, plan.track, source, _pictures(plan))
+    if plan.regions is not None:
+        write_table(table, traces, source.acquisition.times, source.acquisition.channel_names)
+    return Video(
+        path=target,
+        poses=poses,
+        traces=traces,
+        table=None if plan.regions is None else table,
+        movie=None,
+        track=plan.track,
+        window=plan.window,
+        notes=(*located.notes, *_remarks(plan)),
+    )
 
 
 def _planned(
     located: Located,
     target: Path,
-    traces: Path,
     window: int | None,
     is_stabilised: bool,
     regions: NDArray[np.integer] | None,
@@ -227,7 +238,7 @@ def _planned(
     return Plan(
         track=track,
         path=str(target),
-        traces=str(traces),
+        traces=str(traces_of(target)[0]),
         smoothness=smoothness_for(located.traces, track, width),
         window=width,
         is_stabilised=is_stabilised,

@@ -3,13 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from hashlib import sha256
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.source import FrameSource
@@ -17,8 +14,6 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.simulation.bundle import Bundle, make_bundle
 from napari_fiberburst.simulation.camera import Camera
 from napari_fiberburst.simulation.events import (
-    Bending,
-    Cells,
     cut,
     draw_bending,
     draw_cells,
@@ -27,13 +22,13 @@ from napari_fiberburst.simulation.events import (
     draw_lifts,
 )
 from napari_fiberburst.simulation.faults import Faults
-from napari_fiberburst.simulation.field import Optics, make_optics
+from napari_fiberburst.simulation.field import make_optics
+from napari_fiberburst.simulation.framing import Simulator, Views, World, fingerprint_of, pixels_of
 from napari_fiberburst.simulation.motion import apply
 from napari_fiberburst.simulation.paths import PATHS, follow
 from napari_fiberburst.simulation.relay import Relay, prepared_flat
 from napari_fiberburst.simulation.scenes import Reach, Scene, make_scene
 from napari_fiberburst.simulation.simulate import (
-    OVERLAY_LIGHT,
     as_homographies,
     check_bundle,
     check_numbers,
@@ -51,27 +46,11 @@ _SHAPE, _FRAMES, _PITCH = (256, 256), 400, 4.7
 _STEP = 0.035
 # The default distance of a cut, in parts of the frame's longer side: nothing is seen in both frames.
 _JUMP = 1.2
-# How far a lifted probe's picture is blurred where no light comes back any more, pitches.
-_BLUR = 4.0
-# The filter that takes the cores out of a frame, in pitches, and the least light of the bundle that it divides by.
-_FILTER, _LEAST_LIGHT = 0.5, 0.05
 # Radius of a cell, in pitches.
 _CELL_RADIUS = 0.75
 # How far a spline sees beyond where it is sampled.
 _SPLINE_REACH = 3
 _STRIP = 128
-
-
-class World(Protocol):
-    """What there is to see, such as a `Scene` or a `Slide`."""
-
-    @property
-    def channels(self) -> int:
-        """Number of channels."""
-
-    def sample(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Return it (..., C) at frame-0 points (..., 2)."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -121,14 +100,14 @@ class SimulatedRecording:
     world: World
     bounds: tuple[float, float, float, float]
     visible: NDArray[np.bool_] | None
-    _views: "_Views"
+    _views: "Views"
 
     def truth(self, numbers: Sequence[int]) -> NDArray[np.float32]:
         """Return what the pixels of some frames look at (n, H, W, C): bent tissue, and cells as they blink.
 
         It is as it would be in contact, without bundle, exposure, marks and noise.
         """
-        pixels = _pixels((self.source.shape[1], self.source.shape[2]))
+        pixels = pixels_of((self.source.shape[1], self.source.shape[2]))
         return np.stack([self._views.look(number, pixels) for number in numbers])
 
     def displacement(self, number: int) -> NDArray[np.float32] | None:
@@ -140,7 +119,7 @@ class SimulatedRecording:
         if bending is None:
             return None
         return bending.at(
-            number, apply(self.homographies[number], _pixels((self.source.shape[1], self.source.shape[2])))
+            number, apply(self.homographies[number], pixels_of((self.source.shape[1], self.source.shape[2])))
         )
 
     def picture(self, bounds: tuple[float, float, float, float], spacing: float = 1.0) -> NDArray[np.float32]:
@@ -175,89 +154,6 @@ class SimulatedRecording:
         """Return the truth that can be written beside the frames, as ``fiberburst simulate --recording`` does."""
         names = ("homographies", "in_contact", "cuts", "exposures", "cells", "traces", "transmission")
         return {name: getattr(self, name) for name in names} | {"core_centres": self.bundle.centres}
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Views:
-    """What frames look at."""
-
-    world: World
-    homographies: NDArray[np.float64]
-    bending: Bending | None
-    cells: Cells | None
-
-    def look(self, number: int, pixels: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return what pixels (..., 2) of a frame look at, (..., C)."""
-        points = apply(self.homographies[number], pixels)
-        if self.bending is not None:
-            points = points + self.bending.at(number, points)
-        seen = self.world.sample(points)
-        return seen if self.cells is None else seen + self.cells.light(number, points)[..., None]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Simulator:
-    """Makes frames of a recording when they are read."""
-
-    views: _Views
-    relay: Relay
-    optics: Optics
-    physics: str
-    camera: Camera
-    exposures: NDArray[np.float64]
-    lifts: NDArray[np.float32]
-    channels: int
-    seed: int
-
-    def __call__(self, numbers: Sequence[int]) -> NDArray[np.generic]:
-        """Return frames by their numbers, (n, H, W, C)."""
-        frames = [self._frame(int(number)) for number in numbers]
-        if not frames:
-            return np.zeros((0, *self._shape, self.channels), np.uint8 if self.camera.bits == 8 else np.uint16)
-        return np.stack(frames)
-
-    def _frame(self, number: int) -> NDArray[np.generic]:
-        seen = self._seen(number)
-        flat = self.relay.flat.astype(np.float32)
-        light = seen * flat if self.physics == "mask" else self.relay.through(seen)
-        light = light * np.float32(self.exposures[number])
-        if self.optics.shading is not None:
-            light = light * self.optics.shading
-        recorded = self.camera.record(light, np.random.default_rng((self.seed, number)))
-        if self.physics == "filtered":
-            recorded = self._without_cores(recorded)
-        recorded[self.optics.marks] = round(OVERLAY_LIGHT * self.camera.full_scale)
-        return recorded
-
-    def _seen(self, number: int) -> NDArray[np.float32]:
-        """Return what the bundle's end sees (H, W, C)."""
-        lift = self.lifts[number]
-        if lift == 1:
-            return np.zeros((*self._shape, self.channels), np.float32)
-        if lift > 0:
-            sigma = float(_BLUR * self.relay.bundle.pitch * lift)
-            blurred = gaussian_filter(self.views.look(number, _pixels(self._shape)), (sigma, sigma, 0))
-            return np.float32((1 - lift) ** 2) * blurred
-        return self.views.look(number, _pixels(self._shape))
-
-    def _without_cores(self, recorded: NDArray[Any]) -> NDArray[Any]:
-        """Return a frame (H, W, C) as vendors show it: smoothed, and divided by the bundle's light."""
-        sigma = _FILTER * self.relay.bundle.pitch
-        dark = self.camera.pedestal * self.camera.full_scale
-        smooth = gaussian_filter(recorded.astype(np.float32) - np.float32(dark), (sigma, sigma, 0))
-        shown = np.where(self._filtered_flat > _LEAST_LIGHT, smooth / np.maximum(self._filtered_flat, _LEAST_LIGHT), 0)
-        shown = np.where(self.optics.field[..., None], shown, 0) + dark
-        frame: NDArray[Any] = np.clip(np.rint(shown), 0, self.camera.full_scale).astype(recorded.dtype)
-        return frame
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.relay.flat.shape[0], self.relay.flat.shape[1]
-
-    @cached_property
-    def _filtered_flat(self) -> NDArray[np.float32]:
-        sigma = _FILTER * self.relay.bundle.pitch
-        return gaussian_filter(self.relay.flat, (sigma, sigma, 0)).astype(np.float32)
 
 
 def simulate_recording(
@@ -374,8 +270,8 @@ def simulate_recording(
     bounds = _bounds(homographies, size, 0.0 if bent is None else bent.most)
     relay = _relay(flat, size, channels, bundle_rng, bundle)
     radius = _CELL_RADIUS * relay.bundle.pitch
-    simulator = _Simulator(
-        views=_Views(
+    simulator = Simulator(
+        views=Views(
             world=_world(scene, size, channels, bounds, scene_rng),
             homographies=homographies,
             bending=bent,
@@ -412,7 +308,7 @@ def _relay(
 
 
 def _recording(
-    simulator: _Simulator,
+    simulator: Simulator,
     name: str,
     cuts: NDArray[np.intp],
     bounds: tuple[float, float, float, float],
@@ -430,7 +326,7 @@ def _recording(
         white_level=float(simulator.camera.full_scale),
         times=np.arange(count) / rate,
     )
-    fingerprint = _fingerprint(simulator, some, rate)
+    fingerprint = fingerprint_of(simulator, some, rate)
     is_filtered = simulator.physics == "filtered"
     flat = np.where(optics.field[..., None], 1.0, 0.0) if is_filtered else relay.flat
     return SimulatedRecording(
@@ -530,24 +426,3 @@ def _check_amounts(**amounts: float | None) -> None:
             raise SettingsError(f"{name} must be a number of at least 0; got {value!r}")
     if amounts["rate"] == 0:
         raise SettingsError("rate must be above 0 frames per second; got 0")
-
-
-def _fingerprint(simulator: _Simulator, some: NDArray[np.generic], rate: float) -> str:
-    """Return what differs where any frame does: of all numbers that frames are made of, and of some frames."""
-    views = simulator.views
-    parts = [some, views.homographies, simulator.exposures, simulator.lifts, simulator.relay.flat]
-    parts += [] if views.cells is None else [views.cells.places, views.cells.traces]
-    parts += [] if views.bending is None else [views.bending.waves, views.bending.courses]
-    digest = sha256(repr((simulator.camera, simulator.physics, simulator.seed, rate)).encode())
-    for part in parts:
-        digest.update(np.ascontiguousarray(part).tobytes())
-    return digest.hexdigest()
-
-
-@lru_cache(maxsize=4)
-def _pixels(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the pixels of a frame, (H, W, 2) as (x, y)."""
-    rows, columns = np.indices(shape, dtype=np.float64)
-    pixels = np.stack([columns, rows], axis=-1)
-    pixels.setflags(write=False)  # it is shared
-    return pixels
