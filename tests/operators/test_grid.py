@@ -39,6 +39,25 @@ def test_outside_there_is_nothing_to_sample_or_to_splat_on(grid):
     assert not any(part.any() for part in at.with_slopes(torch.rand(grid.shape)))
 
 
+def test_a_part_of_a_grid_does_to_its_points_what_the_grid_does(grid, points):
+    near, weights = points[(points[:, 0] > 5) & (points[:, 0] < 11) & (points[:, 1] < 25)], torch.rand(200)
+    part, nodes = grid.part_about(torch.cat([near, torch.tensor([[float("nan"), 3.0], [-90.0, 5.0]])]))
+    assert part.shape[0] < grid.shape[0]
+    assert part.shape[1] < grid.shape[1]
+    torch.testing.assert_close(part.nodes(), grid.nodes()[nodes], rtol=0, atol=1e-5)
+    whole = torch.zeros(grid.shape)
+    whole[nodes] = part.at(near).adjoint(weights[: len(near)])
+    torch.testing.assert_close(whole, grid.at(near).adjoint(weights[: len(near)]), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("place", [(50.0, 50.0), (20.7, 33.0), (-3.0, 2.0)])
+def test_a_part_has_a_cell_at_least_and_stays_in_its_grid(grid, place):
+    part, (rows, columns) = grid.part_about(torch.tensor([place]))
+    assert part.shape == (2, 2)
+    for some, count in zip((rows, columns), grid.shape, strict=True):
+        assert 0 <= some.start < some.stop <= count
+
+
 def test_the_stencil_is_sample_then_weigh_then_splat(grid, points):
     image, weights = torch.rand(2, *grid.shape), torch.rand(200)
     at = grid.at(points)

@@ -55,6 +55,22 @@ class Grid:
         x1, y1 = (flat.amax(dim=0) + margin).tolist()
         return cls.over((x0, y0, x1, y1), spacing)
 
+    def part_about(self, points: Tensor) -> tuple["Grid", tuple[slice, slice]]:
+        """Return the part of this grid that points (..., 2) lie in, and which rows and columns that is."""
+        flat = points.reshape(-1, 2)
+        flat = flat[self.at(flat).inside]
+        place = (flat - flat.new_tensor([self.x0, self.y0])) / self.spacing
+        low, high = (place.amin(dim=0), place.amax(dim=0)) if len(flat) else (torch.zeros(2), torch.zeros(2))
+        left, top = (min(math.floor(at), count - 2) for at, count in zip(low, reversed(self.shape), strict=True))
+        right, bottom = (max(math.ceil(at), first + 1) for at, first in zip(high, (left, top), strict=True))
+        part = Grid(
+            self.x0 + left * self.spacing,
+            self.y0 + top * self.spacing,
+            self.spacing,
+            (bottom - top + 1, right - left + 1),
+        )
+        return part, (slice(top, bottom + 1), slice(left, right + 1))
+
     def nodes(self, device: torch.device | None = None) -> Tensor:
         """Return the position (x, y) of every node, (rows, columns, 2)."""
         rows, columns = (torch.arange(count, device=device) * self.spacing for count in self.shape)

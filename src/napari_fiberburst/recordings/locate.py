@@ -18,6 +18,7 @@ from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.recordings.links import Links
 from napari_fiberburst.recordings.poses import Poses, solve_poses
+from napari_fiberburst.recordings.rectify import rectified
 from napari_fiberburst.recordings.refine import (
     Refinement,
     ask_to_bend,
@@ -46,8 +47,8 @@ _WORTH_BENDING = 0.9
 _MOST_MISSED = 4.0
 # Places are doubtful where more than this part of the frames has none, or the median frame is less like the scene.
 _MOST_LOST, _LEAST_ALIKE = 0.25, 0.93
-# Gains and exposures have settled after so many rounds.
-_SETTLED = 2
+# Gains and exposures have settled, and scenes are rectified, after so many rounds.
+_SETTLED = 3
 # Degrees of freedom of links: frames of fewer are placed anew where they turn.
 _TURNING = 4
 # The slow changes of the illumination are told by so many frames, spread over the recording.
@@ -133,7 +134,7 @@ def _refining(
         for _, left in complete(refine_unit, stage, work, units, client):
             yield Doing("refining", number, _MOST_ROUNDS, left, len(units))
         parts = [Refinement.load(work.path(stage, unit)) for unit in units]
-        track, settled = refined(track, parts), settled + 1
+        track, settled = rectified(refined(track, parts), parts), settled + 1
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
         asked = larger_model(track, parts) if is_free and settled >= _SETTLED else track.dof

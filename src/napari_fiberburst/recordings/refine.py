@@ -17,6 +17,7 @@ from napari_fiberburst.operators.grid import Grid, Sampling
 from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.bending import Bend, basis, control_grid
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
+from napari_fiberburst.recordings.step import MODELS, Seen, stepped
 from napari_fiberburst.recordings.tiles import pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
 from napari_fiberburst.recordings.track import Track
@@ -30,14 +31,8 @@ TILE_SIDE = 1024
 _ITERATIONS = 32
 # Residuals beyond so many of their root mean square count less.
 _ROBUST = 2.5
-# That an exposure is 1 is known as well as the light of so many cores of full brightness would tell it.
-_EXPOSURE_PRIOR = 1.0
-# Of a step of Gauss-Newton: pixels along an axis, relative change of exposure, and radians or relative growth, at most.
-_MOST_SHIFT, _MOST_EXPOSURE, _MOST_TURN = 2.0, 0.5, 0.02
 # Gains of cores that have seen less than this part of the usual light are left, and no gain changes by more than this.
 _LEAST_LIGHT, _MOST_GAIN = 0.05, 5.0
-# Degrees of freedom: shifts, similarities, affine transforms.
-_MODELS = (2, 4, 6)
 # A larger model is asked for where it explains the median frame better than noise would by this ratio.
 _ASKED = 4.0
 # One frame in so many is asked whether it bends; where the median one of these would keep more than this part of what
@@ -68,6 +63,9 @@ class Refinement(Stored):
     asked : numpy.ndarray
         (n, 2) by how much turning and growing, and stretching beside them, would explain each frame better, for each
         unknown, in mean squares of what the scene misses: what noise alone makes of it is about 1.
+    strain, certainty : numpy.ndarray
+        (n, 4) by how much the scene is grown, turned and stretched where each frame lies, as a frame that may do so
+        tells it; and one over the variance of each.
     bending : numpy.ndarray
         (n,) what part of its root mean square a first bend would leave of what the scene misses of a frame; NaN where
         that was not asked.
@@ -84,6 +82,8 @@ class Refinement(Stored):
     missed: NDArray[np.float64]
     alike: NDArray[np.float64]
     asked: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    certainty: NDArray[np.float64]
     bending: NDArray[np.float64]
     agreement: Tensor
     power: Tensor
@@ -118,6 +118,8 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
         missed=np.concatenate([part.missed for part in found] or [np.zeros(0)]),
         alike=np.concatenate([part.alike for part in found] or [np.zeros(0)]),
         asked=np.concatenate([part.asked for part in found] or [np.zeros((0, 2))]),
+        strain=np.concatenate([part.strain for part in found] or [np.zeros((0, 4))]),
+        certainty=np.concatenate([part.certainty for part in found] or [np.zeros((0, 4))]),
         bending=np.concatenate([part.bending for part in found] or [np.zeros(0)]),
         agreement=sum((part.agreement for part in found), none),
         power=sum((part.power for part in found), none),
@@ -134,24 +136,27 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     typical = rows.rms(residual, weights)[:, 0]
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
     slopes = along_x, along_y
-    exposures, matrices, asked, left = _stepped(track, frames, points, robust, residual, light, slopes)
-    bend = Bend(basis(track.shape, traces.template.positions), track.shape, robust, left, slopes, typical)
+    step = stepped(track, frames, points, Seen(residual, robust, light, slopes))
+    bend = Bend(basis(track.shape, traces.template.positions), track.shape, robust, step.left, slopes, typical)
     control, told = None, np.full(len(frames), np.nan)
     if track.control is not None:
         control = torch.from_numpy(track.control[frames])
         control = control + torch.stack([bend.step(number, one)[0] for number, one in enumerate(control)])
-    elif track.dof == _MODELS[-1]:
+    elif track.dof == MODELS[-1]:
         for number in np.flatnonzero(frames % _ASKED_OF == 0).tolist():
             told[number] = bend.step(number, None)[1]
     agreement, power = _light(samples, sampling, robust, filtered)
+    variance = typical.double().numpy()[:, None] ** 2
     return Refinement(
         frames=frames,
-        scene_from_frame=matrices,
+        scene_from_frame=step.scene_from_frame,
         control=None if control is None else control.numpy(),
-        exposures=exposures,
+        exposures=step.exposures,
         missed=typical.double().numpy(),
         alike=rows.correlation(samples.grey, light, weights).double().numpy(),
-        asked=asked / typical.double().numpy()[:, None] ** 2,
+        asked=step.lowered / variance,
+        strain=step.strain,
+        certainty=step.information / variance,
         bending=told,
         agreement=agreement,
         power=power,
@@ -162,49 +167,6 @@ def _light(samples: Samples, sampling: Sampling, weights: Tensor, filtered: Tens
     light = sampling.of_channels(filtered)
     weighted = weights[..., None] * light
     return (weighted * samples.values).sum(dim=0), (weighted * light).sum(dim=0)
-
-
-def _stepped(
-    track: Track,
-    frames: NDArray[np.int64],
-    points: Tensor,
-    weights: Tensor,
-    residual: Tensor,
-    light: Tensor,
-    slopes: tuple[Tensor, Tensor],
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], Tensor]:
-    """Return exposures and places of frames after one step of Gauss-Newton each.
-
-    And by how much each unknown of the two larger models would lower the residuals' square, (n, 2); and what the step
-    leaves of the residuals.
-    """
-    along_x, along_y = slopes
-    half = max(track.shape) / 2
-    middle = (points * weights[..., None]).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-9)[:, None]
-    x, y = ((points - middle[:, None]) / half).unbind(dim=-1)
-    turns = [x * along_x + y * along_y, x * along_y - y * along_x]
-    stretches = [x * along_x - y * along_y, y * along_x + x * along_y]
-    jacobian = torch.stack([light, along_x, along_y, *(half * part for part in turns + stretches)], dim=1)
-    weighted = jacobian * weights[:, None]
-    normal = weighted @ jacobian.mT
-    normal = normal + torch.diag_embed(1e-4 * normal.diagonal(dim1=1, dim2=2) + 1e-9)
-    normal[:, 0, 0] += _EXPOSURE_PRIOR
-    rhs = (weighted @ residual[..., None])[..., 0]
-    steps = {dof: torch.linalg.solve(normal[:, : dof + 1, : dof + 1], rhs[:, : dof + 1]) for dof in _MODELS}
-    lowered = [(step * rhs[:, : step.shape[1]]).sum(dim=1) for step in steps.values()]
-    asked = torch.stack([(lowered[1] - lowered[0]) / 2, (lowered[2] - lowered[1]) / 2], dim=1)
-    step = torch.nn.functional.pad(steps[track.dof], (0, _MODELS[-1] - track.dof)).double().numpy()
-    exposures = track.exposures[frames] * (1 + step[:, 0].clip(-_MOST_EXPOSURE, _MOST_EXPOSURE)).astype(np.float32)
-    grown, turned, along, across = step[:, 3:].clip(-_MOST_TURN, _MOST_TURN).T
-    change = np.zeros((len(frames), 3, 3))
-    change[:, 0, 0], change[:, 1, 1] = 1 + grown + along, 1 + grown - along
-    change[:, 1, 0], change[:, 0, 1], change[:, 2, 2] = turned + across, across - turned, 1
-    centre = middle.double().numpy()
-    shift = step[:, 1:3].clip(-_MOST_SHIFT, _MOST_SHIFT)
-    change[:, :2, 2] = shift + centre - np.einsum("nij,nj->ni", change[:, :2, :2], centre)
-    taken = torch.from_numpy(step).to(residual)
-    left = residual - (taken[:, None] @ jacobian)[:, 0]
-    return exposures, change @ track.scene_from_frame[frames], asked.double().numpy(), left
 
 
 def refined(track: Track, parts: list[Refinement]) -> Track:
@@ -264,8 +226,8 @@ def larger_model(track: Track, parts: list[Refinement]) -> int:
 
     It can be told once gains and exposures have settled; before, what is wrong with them asks for it, too.
     """
-    if not parts or track.dof == _MODELS[-1]:
+    if not parts or track.dof == MODELS[-1]:
         return track.dof
-    step = _MODELS.index(track.dof)
+    step = MODELS.index(track.dof)
     asked = np.concatenate([part.asked for part in parts])[:, step]
-    return _MODELS[step + 1] if len(asked) and np.median(asked) > _ASKED else track.dof
+    return MODELS[step + 1] if len(asked) and np.median(asked) > _ASKED else track.dof

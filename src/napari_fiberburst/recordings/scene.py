@@ -55,7 +55,8 @@ def equations(
     for some in frames_together(traces, frames):
         samples, points = corrected(traces, track, some), track.points(some, template.positions)
         belongs = None if filtered is None else _belonging(samples, grid.at(points), filtered, track.error)
-        total = total + assemble(grid, samples, points, belongs)
+        part, nodes = grid.part_about(points)
+        total.include(assemble(part, samples, points, belongs), nodes)
     return total
 
 

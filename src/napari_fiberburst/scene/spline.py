@@ -103,6 +103,14 @@ class NormalEquations:
         """Forget samples that were added; those that looked along paths cannot be told apart any more."""
         return replace(self, bands=self.bands - other.bands, rhs=self.rhs - other.rhs)
 
+    def include(self, part: "NormalEquations", nodes: tuple[slice, slice]) -> None:
+        """Add, in place, samples that stood still on a part of this grid, of these rows and columns.
+
+        Hundreds of frames of a wide scene each see little of it.
+        """
+        self.bands[:, *nodes] += part.bands
+        self.rhs[:, *nodes] += part.rhs
+
     def on(self, grid: Grid) -> "NormalEquations":
         """Return the equations on another grid whose nodes lie at the same places, wider or narrower than this one.
 
