@@ -46,11 +46,10 @@ def test_few_frames_of_a_lazy_recording_are_read(open_dock, grey_frames, qtbot):
         read.append(block_info[None]["chunk-location"][0])
         return grey_frames[read[-1] % len(grey_frames)][None]
 
-    frames = dask.array.map_blocks(frame, chunks=((1,) * 600, (63,), (75,)), dtype=np.uint8)
+    frames = dask.array.map_blocks(frame, chunks=((1,) * 5000, (63,), (75,)), dtype=np.uint8)
     _, dock = open_dock(Image(frames, name="recording"))
-    assert said(dock, qtbot).startswith("600 frames")
-    assert len({number for number in read if number < 50}) >= 8
-    assert len(set(read)) < 20
+    assert said(dock, qtbot).startswith("20 frames of a recording")
+    assert len(set(read)) < 500
 
 
 def test_frames_that_cannot_be_read_are_said(open_dock, qtbot):

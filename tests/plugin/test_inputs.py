@@ -167,6 +167,7 @@ def test_a_dask_layer_is_a_burst(open_dock, run_through, grey_frames):
 
 def test_more_than_fits_is_refused_with_a_reason(open_dock, grey_frames):
     _, dock = open_dock(Image(np.broadcast_to(grey_frames[:1], (10**6, 63, 75))))
+    dock.input.frames.edit.setText("0:1000000")
     (notice,) = notices_during(dock.picture.start)
     assert "GB of memory" in notice
     assert "draw a region" in notice

@@ -7,6 +7,7 @@ both see something.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import sha256
 from typing import Literal
 
 import numpy as np
@@ -41,9 +42,10 @@ class OverlapCorrelation:
     def __init__(self, look_up: Callable[[int], tuple[Tensor, Tensor]], shape: tuple[int, int], kept: int) -> None:
         self._look_up = look_up
         self._shape = tuple(int(next_fast_len(2 * side, real=True)) for side in shape)
-        # Most recordings have one mask for all frames, so what is correlated with it serves many pairs.
-        self._numbers: dict[bytes, int] = {}
-        self._masks: list[Tensor] = []
+        # Most recordings have one mask for all frames, so what is correlated with it serves many pairs. A mask goes by
+        # the number of the first image that had it.
+        self._owners: dict[bytes, int] = {}
+        self._mask = lru_cache(maxsize=kept)(self._mask_of)
         self._image = lru_cache(maxsize=kept)(self._image_of)
         self._overlap = lru_cache(maxsize=kept)(self._overlap_of)
         self._side = lru_cache(maxsize=2 * kept)(self._side_of)
@@ -82,17 +84,20 @@ class OverlapCorrelation:
         y, x = (-torch.fft.fftfreq(side, d=1 / side) for side in self._shape)
         return torch.hypot(x[None, :] - shift[0], y[:, None] - shift[1]) <= radius
 
+    def _mask_of(self, owner: int) -> Tensor:
+        """Return the spectrum of the mask of an image."""
+        image, mask = self._look_up(owner)
+        spectrum: Tensor = torch.fft.rfft2(mask.to(image), s=self._shape)
+        return spectrum
+
     def _image_of(self, number: int) -> "_Image":
         image, mask = self._look_up(number)
-        key = mask.cpu().numpy().tobytes()
-        if key not in self._numbers:
-            self._numbers[key] = len(self._masks)
-            self._masks.append(torch.fft.rfft2(mask.to(image), s=self._shape))
+        owner = self._owners.setdefault(sha256(mask.cpu().numpy().tobytes()).digest(), number)
         weight = mask.to(image)
         area = float(weight.sum())
         centred = (image - (image * weight).sum() / max(area, 1.0)) * weight
         return _Image(
-            mask=self._numbers[key],
+            mask=owner,
             area=area,
             power=float(centred.square().sum()),
             spectra={
@@ -103,9 +108,9 @@ class OverlapCorrelation:
 
     def _overlap_of(self, mask: int, mask_second: int) -> tuple[Tensor, Tensor]:
         """Return how many pixels two masks have in common at every shift, and as a part of the smaller one."""
-        overlap = self._correlate(self._masks[mask], self._masks[mask_second]).clamp_min(1e-3)
+        overlap = self._correlate(self._mask(mask), self._mask(mask_second)).clamp_min(1e-3)
         # The first coefficient of a spectrum is the sum.
-        area = min(float(self._masks[number][0, 0].real) for number in (mask, mask_second))
+        area = min(float(self._mask(number)[0, 0].real) for number in (mask, mask_second))
         return overlap, overlap / area
 
     def _side_of(self, number: int, other_mask: int, is_first: bool) -> tuple[Tensor, Tensor]:
@@ -113,7 +118,7 @@ class OverlapCorrelation:
 
         They depend on the other image's mask alone, so most pairs share them.
         """
-        image, mask = self._image(number), self._masks[other_mask]
+        image, mask = self._image(number), self._mask(other_mask)
         if not is_first and image.mask == other_mask:  # as the other way about, with all shifts reversed
             sums, scale = self._side(number, other_mask, True)
             return _reversed(sums), _reversed(scale)
@@ -139,7 +144,7 @@ class _Image:
     Attributes
     ----------
     mask : int
-        Number of its mask.
+        Number of the first image that had its mask.
     area : float
         Of the mask, pixels.
     power : float
