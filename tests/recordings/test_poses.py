@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from napari_fiberburst.recordings.links import Links
-from napari_fiberburst.recordings.poses import solve_poses
-from napari_fiberburst.recordings.register import crossings, expected
+from napari_fiberburst.recordings.poses import Poses, solve_poses
+from napari_fiberburst.recordings.register import crossings, expected, meetings
 
 COUNT, SIDE = 60, 91.0
 
@@ -162,3 +162,18 @@ def test_crossings_are_where_a_path_meets_itself(rng):
     assert (second - first > 8).all()
     np.testing.assert_allclose(place[first], place[second], atol=11)
     assert (3, 56) in pairs
+
+
+def test_frames_before_and_after_a_gap_are_compared():
+    piece = np.array([0] * 20 + [-1] * 3 + [1] * 10)
+    poses = Poses(
+        turn=np.ones(33, complex),
+        place=np.arange(33) * (9.0 + 0j),
+        piece=piece,
+        trust=np.zeros(0),
+        error=np.zeros(0),
+        dof=2,
+    )
+    pairs = meetings(poses, 97)
+    assert {(19, 23), (17, 25)} <= set(pairs)
+    assert all(piece[one] >= 0 and piece[other] >= 0 and piece[one] != piece[other] for one, other in pairs)

@@ -1,5 +1,6 @@
 """Step 2 of a long recording: where every frame lies, by pairs of frames in time and wherever the path meets itself."""
 
+import gc
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -29,6 +30,9 @@ _PASS, _MOST_PASSES = 8, 10
 # Of so many pieces, the largest, frames are compared with those of others: those that lie this far apart, in parts of
 # the field's shorter side, and so many of a piece.
 _MOST_PIECES, _APART, _MOST_KEPT = 8, 0.4, 24
+# So many frames before a piece ends and after the next one begins are compared: a probe that was lifted comes down
+# near where it was.
+_ABOUT_A_GAP = 3
 # Pairs to a unit of work.
 _PAIRS = 256
 
@@ -114,7 +118,9 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
         for unit in units:
             links = links + Links.load(work.path(stage, unit))
         poses = solve_poses(links, len(traces), dof)
-    _linker.cache_clear()  # images and spectra: some 150 MB that are not needed any more
+    # Images and spectra are not needed any more: some 300 MB, held by what refers to itself.
+    _linker.cache_clear()
+    gc.collect()
     return links
 
 
@@ -125,8 +131,16 @@ def _at_gap(frames: NDArray[np.int64], gap: int, poses: Poses) -> list[Pair]:
 def meetings(poses: Poses, side: float) -> list[Pair]:
     """Return pairs of frames of different pieces that may show the same place, though nothing says so.
 
-    Of each of the largest pieces some frames that lie apart.
+    Of each of the largest pieces some frames that lie apart, and those before and after contact was lost.
     """
+    placed = np.flatnonzero(poses.piece >= 0)
+    gaps = np.flatnonzero(np.diff(poses.piece[placed])) + 1
+    pairs = {
+        (int(one), int(other))
+        for gap in gaps
+        for one in placed[max(0, gap - _ABOUT_A_GAP) : gap]
+        for other in placed[gap : gap + _ABOUT_A_GAP]
+    }
     chosen = []
     for piece in range(min(int(poses.piece.max(initial=-1)) + 1, _MOST_PIECES)):
         frames = np.flatnonzero(poses.piece == piece)
@@ -135,12 +149,9 @@ def meetings(poses: Poses, side: float) -> list[Pair]:
             if np.abs(poses.place[frame] - poses.place[kept]).min() > _APART * side:
                 kept.append(frame)
         chosen.append(kept[:: -(-len(kept) // _MOST_KEPT)])
-    return [
-        (min(one, other), max(one, other))
-        for first, second in combinations(chosen, 2)
-        for one in first
-        for other in second
-    ]
+    for first, second in combinations(chosen, 2):
+        pairs.update((min(one, other), max(one, other)) for one in first for other in second)
+    return sorted(pairs)
 
 
 def crossings(poses: Poses, side: float) -> list[Pair]:
