@@ -150,7 +150,7 @@ def _refining(
         track = unbent
     # The weight of a frame falls with the square of what the scene misses of it.
     belongs = track.weights > 1 / _MOST_MISSED**2
-    return replace(track, piece=np.where(belongs, track.piece, -1))
+    return replace(track, piece=np.where(belongs, track.piece, -1)).anchored()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

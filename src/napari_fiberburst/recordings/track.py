@@ -1,6 +1,6 @@
 """Track: where the frames of a recording lie, how bright they are, and what gains their cores have."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -69,6 +69,20 @@ class Track(Stored):
     def pieces(self) -> int:
         """How many scenes there are, each with at least two frames."""
         return int(self.piece.max(initial=-1)) + 1
+
+    def anchored(self) -> "Track":
+        """Return the track with the scene of each piece in the pixels of its first frame, which refining leaves."""
+        matrices = self.scene_from_frame.copy()
+        control = None if self.control is None else self.control.copy()
+        for piece in range(self.pieces):
+            frames = self.frames_of(piece)
+            if not len(frames):
+                continue
+            back = np.linalg.inv(matrices[frames[0]])
+            matrices[frames] = back @ matrices[frames]
+            if control is not None:
+                control[frames] = back[:2, :2].astype(np.float32) @ control[frames]
+        return replace(self, scene_from_frame=matrices, control=control)
 
     def points(self, numbers: NDArray[np.int64], positions: Tensor) -> Tensor:
         """Return where positions (N, 2) of frames lie in their scene, (n, N, 2)."""

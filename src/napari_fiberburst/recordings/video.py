@@ -231,7 +231,7 @@ def _planned(
     is_stabilised: bool,
     regions: NDArray[np.integer] | None,
 ) -> Plan:
-    track, shape = _anchored(located.track), located.work.bundle.shape
+    track, shape = located.track, located.work.bundle.shape
     width = window_for(track, located.work.bundle.pitch) if window is None else window
     picture = _canvas(track) if is_stabilised else Grid(0.0, 0.0, 1.0, shape)
     where = "the stabilised picture" if is_stabilised else "a frame"
@@ -245,15 +245,6 @@ def _planned(
         canvas=(picture.x0, picture.y0, *picture.shape),
         regions=None if regions is None else check_regions(regions, picture.shape, where),
     )
-
-
-def _anchored(track: Track) -> Track:
-    """Return the track with the scene of each piece in the pixels of its first frame, which refining leaves by some."""
-    matrices = track.scene_from_frame.copy()
-    for piece in range(track.pieces):
-        frames = track.frames_of(piece)
-        matrices[frames] = np.linalg.inv(matrices[frames[0]]) @ matrices[frames]
-    return replace(track, scene_from_frame=matrices)
 
 
 def _canvas(track: Track) -> Grid:

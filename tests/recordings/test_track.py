@@ -1,0 +1,53 @@
+"""Tracks: scenes are in the pixels of their first frames."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from napari_fiberburst.recordings.bending import control_grid
+from napari_fiberburst.recordings.track import Track
+
+SHAPE = (61, 83)
+
+
+@pytest.fixture
+def track():
+    """Return two pieces of frames that are turned, stretched and bent; frame 3 is in none."""
+    rng = np.random.default_rng(0)
+    matrices = np.tile(np.eye(3), (6, 1, 1))
+    matrices[:, :2] += rng.normal(0, 0.05, (6, 2, 3))
+    matrices[:, :2, 2] += rng.normal(0, 30, (6, 2))
+    rows, columns = control_grid(SHAPE).shape
+    return Track(
+        scene_from_frame=matrices,
+        piece=np.array([1, 0, 0, -1, 0, 1]),
+        exposures=np.ones(6, np.float32),
+        gains=np.ones((5, 1), np.float32),
+        weights=np.ones(6, np.float32),
+        alike=np.ones(6),
+        error=0.01,
+        shape=SHAPE,
+        dof=6,
+        control=rng.normal(0, 2, (6, 2, rows * columns)).astype(np.float32),
+    )
+
+
+def test_first_frames_lie_on_their_own_pixels(track):
+    np.testing.assert_allclose(track.anchored().scene_from_frame[[0, 1]], np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
+
+
+def test_frames_lie_on_one_another_as_before(track):
+    corners = torch.tensor([[0.0, 0.0], [82.0, 13.0], [31.0, 60.0]])
+    before, after = (some.points(np.arange(6), corners).double() for some in (track, track.anchored()))
+    for first, others in ((1, [2, 4]), (0, [5])):
+        to_first = torch.from_numpy(np.linalg.inv(track.scene_from_frame[first]))
+        moved = before[others] @ to_first[:2, :2].T + to_first[:2, 2]
+        torch.testing.assert_close(after[others], moved, rtol=0, atol=1e-4)
+
+
+def test_frames_without_a_piece_are_left(track):
+    np.testing.assert_array_equal(track.anchored().scene_from_frame[3], track.scene_from_frame[3])
+    lost = replace(track, piece=np.full(6, -1))
+    np.testing.assert_array_equal(lost.anchored().scene_from_frame, track.scene_from_frame)
