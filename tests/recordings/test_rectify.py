@@ -58,6 +58,7 @@ def told(track, strain, certainty):
         asked=np.zeros((count, 2)),
         strain=strain,
         certainty=np.full((count, 4), certainty),
+        rarity=np.ones(count),
         bending=nothing,
         agreement=None,
         power=None,

@@ -51,3 +51,21 @@ def test_frames_without_a_piece_are_left(track):
     np.testing.assert_array_equal(track.anchored().scene_from_frame[3], track.scene_from_frame[3])
     lost = replace(track, piece=np.full(6, -1))
     np.testing.assert_array_equal(lost.anchored().scene_from_frame, track.scene_from_frame)
+
+
+def test_frames_are_chosen_evenly_over_places(track):
+    count = 90
+    place = np.concatenate([np.arange(30), np.full(60, 29.0)]) * 10
+    matrices = np.tile(np.eye(3), (count, 1, 1))
+    matrices[:, 0, 2] = place
+    rested = replace(
+        track, scene_from_frame=matrices, piece=np.where(np.arange(count) == 40, -1, 0), control=None, dof=2
+    )
+    rarity = rested.rarity(4.0)
+    np.testing.assert_allclose(rarity[:29], 1)
+    np.testing.assert_allclose(rarity[[29, 89]], 1 / 60)
+    assert rarity[40] == 0
+    chosen = rested.spread(rested.frames_of(0), 10, 4.0)
+    assert 8 <= len(chosen) <= 10
+    assert (place[chosen] == 290).sum() <= 2
+    np.testing.assert_array_equal(rested.spread(rested.frames_of(0)[:5], 50, 4.0), np.arange(5))

@@ -228,8 +228,7 @@ def _evened(traces: Traces, track: Track) -> Track:
     Scene and gains follow one another where those change slowly over the frame, so that finding them in turn takes many
     rounds. Some frames of the largest piece tell them at once.
     """
-    frames = track.frames_of(0)
-    frames = frames[:: max(1, len(frames) // _SHADED_FROM)]
+    frames = track.spread(track.frames_of(0), _SHADED_FROM, traces.template.pitch)
     samples = traces.samples(frames).without_gains(torch.from_numpy(track.gains))
     registration = Registration.known(track.scene_from_frame[frames], track.shape, samples.cores)
     shading = find_shading(samples, replace(registration, exposures=track.exposures[frames]))

@@ -22,7 +22,7 @@ from napari_fiberburst.recordings.tiles import pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.work import Work
-from napari_fiberburst.scene.smoothness import UNTOLD
+from napari_fiberburst.scene.smoothness import UNTOLD, weighted_median
 from napari_fiberburst.stored import Stored
 
 # Side of the tiles on which frames are compared with the scene, nodes: all of most mosaics.
@@ -66,11 +66,14 @@ class Refinement(Stored):
     strain, certainty : numpy.ndarray
         (n, 4) by how much the scene is grown, turned and stretched where each frame lies, as a frame that may do so
         tells it; and one over the variance of each.
+    rarity : numpy.ndarray
+        (n,) as that of `Track`, within a core distance.
     bending : numpy.ndarray
         (n,) what part of its root mean square a first bend would leave of what the scene misses of a frame; NaN where
         that was not asked.
     agreement, power : Tensor
-        (N, C), sums over the frames of what each core shows times what the scene shows, and of the latter's square.
+        (N, C), sums over the frames, weighed by their rarity, of what each core shows times what the scene shows, and
+        of the latter's square.
     """
 
     _kind: ClassVar[str] = "refinement"
@@ -84,6 +87,7 @@ class Refinement(Stored):
     asked: NDArray[np.float64]
     strain: NDArray[np.float64]
     certainty: NDArray[np.float64]
+    rarity: NDArray[np.float64]
     bending: NDArray[np.float64]
     agreement: Tensor
     power: Tensor
@@ -105,7 +109,8 @@ def refine_units(track: Track) -> range:
 
 def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, filtered: Tensor) -> Refinement:
     """Compare frames with the scene (C, H, W) as cores see it."""
-    found = [_compare(traces, track, some, grid, filtered) for some in frames_together(traces, frames)]
+    rarity = track.rarity(traces.template.pitch)
+    found = [_compare(traces, track, some, grid, filtered, rarity[some]) for some in frames_together(traces, frames)]
     _, cores, channels = traces.template.values.shape
     none = torch.zeros(cores, channels)
     return Refinement(
@@ -120,13 +125,21 @@ def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, 
         asked=np.concatenate([part.asked for part in found] or [np.zeros((0, 2))]),
         strain=np.concatenate([part.strain for part in found] or [np.zeros((0, 4))]),
         certainty=np.concatenate([part.certainty for part in found] or [np.zeros((0, 4))]),
+        rarity=np.concatenate([part.rarity for part in found] or [np.zeros(0)]),
         bending=np.concatenate([part.bending for part in found] or [np.zeros(0)]),
         agreement=sum((part.agreement for part in found), none),
         power=sum((part.power for part in found), none),
     )
 
 
-def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, filtered: Tensor) -> Refinement:
+def _compare(
+    traces: Traces,
+    track: Track,
+    frames: NDArray[np.int64],
+    grid: Grid,
+    filtered: Tensor,
+    rarity: NDArray[np.float64],
+) -> Refinement:
     samples = corrected(traces, track, frames)
     points = track.points(frames, traces.template.positions)
     sampling = grid.at(points)
@@ -145,7 +158,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
     elif track.dof == MODELS[-1]:
         for number in np.flatnonzero(frames % _ASKED_OF == 0).tolist():
             told[number] = bend.step(number, None)[1]
-    agreement, power = _light(samples, sampling, robust, filtered)
+    agreement, power = _light(samples, sampling, robust * torch.from_numpy(rarity)[:, None].to(robust), filtered)
     variance = typical.double().numpy()[:, None] ** 2
     return Refinement(
         frames=frames,
@@ -157,6 +170,7 @@ def _compare(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid
         asked=step.lowered / variance,
         strain=step.strain,
         certainty=step.information / variance,
+        rarity=rarity,
         bending=told,
         agreement=agreement,
         power=power,
@@ -179,10 +193,10 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
         return track
     matrices, exposures, alike = (getattr(track, name).copy() for name in ("scene_from_frame", "exposures", "alike"))
     control = None if track.control is None else track.control.copy()
-    missed = np.full(len(track), np.nan)
+    missed, rarity = np.full(len(track), np.nan), np.zeros(len(track))
     for part in parts:
         matrices[part.frames], exposures[part.frames] = part.scene_from_frame, part.exposures
-        missed[part.frames], alike[part.frames] = part.missed, part.alike
+        missed[part.frames], alike[part.frames], rarity[part.frames] = part.missed, part.alike, part.rarity
         if control is not None and part.control is not None:
             control[part.frames] = part.control
     piece = np.where(alike >= _LEAST_ALIKE, track.piece, -1)
@@ -195,7 +209,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     known = power > _LEAST_LIGHT * power.median()
     ratio = torch.where(known, agreement / power.clamp_min(1e-12), torch.ones_like(power))
     gains = track.gains * ratio.clamp(1 / _MOST_GAIN, _MOST_GAIN).numpy()
-    usual = float(np.nanmedian(missed))
+    usual = weighted_median(missed[rarity > 0], rarity[rarity > 0])
     return replace(
         track,
         scene_from_frame=matrices,

@@ -86,15 +86,16 @@ def told_by(traces: Traces, track: Track, piece: int) -> Told:
     """Choose how smooth a piece is to be, where its liveliest frame with many others about it looks."""
     frames = track.frames_of(piece)
     middle = track.corners(frames).mean(axis=1)
-    near = cKDTree(middle).query_ball_point(middle, min(track.shape) / 4, return_length=True)
+    rarity = track.rarity(traces.template.pitch)[frames]
+    near = np.array([rarity[some].sum() for some in cKDTree(middle).query_ball_point(middle, min(track.shape) / 4)])
     lively = traces.summary.contrast.numpy()[frames] * (near >= np.median(near))
     x, y = middle[int(np.argmax(lively))]
     half = _WINDOW // 2
     window = Grid(float(round(x)) - half, float(round(y)) - half, 1.0, (_WINDOW, _WINDOW))
     touching = track.touching(window, piece)
-    touching = touching[:: max(1, len(touching) // _FRAMES_TOLD)]
     if len(touching) < 2:
         return Told(smoothness=UNTOLD, agreement=None)
+    touching = track.spread(touching, _FRAMES_TOLD, traces.template.pitch)
     samples, points = corrected(traces, track, touching), track.points(touching, traces.template.positions)
     empty = torch.zeros(window.shape)
     chosen = choose_smoothness(samples, points, np.arange(len(touching)), window, empty)

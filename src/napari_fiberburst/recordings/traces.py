@@ -1,6 +1,6 @@
 """What every core of a bundle has seen in every frame: all that is needed of a recording, at a tenth of its size."""
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -13,6 +13,7 @@ from torch import Tensor
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.samples import Samples, contrast_and_glare, in_grey, sample_cores, shows_something
 from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.recordings.places import mean_over_places
 from napari_fiberburst.recordings.work import Doing, Work, complete
 from napari_fiberburst.stored import Stored
 
@@ -73,7 +74,7 @@ class Summary(Stored):
     contrast, glare : Tensor
         (T,), as those of `TracePart`.
     mean_light : Tensor
-        (N,), the mean of what each core has seen, grey.
+        (N,), the mean of what each core has seen, grey, over the places where it was.
     """
 
     _kind: ClassVar[str] = "summary of traces"
@@ -83,24 +84,23 @@ class Summary(Stored):
     mean_light: Tensor
 
     @classmethod
-    def of(cls, parts: Iterable[TracePart]) -> "Summary":
-        """Return the summary of all parts."""
-        told: list[tuple[Tensor, Tensor]] = []
-        total = mass = torch.zeros(())
-        for part in parts:
-            told.append((part.contrast, part.glare))
-            shows = shows_something(part.contrast, part.glare)
-            weights = part.weights * shows[:, None]
-            total = total + (part.values.mean(dim=2) * weights).sum(dim=0)
-            mass = mass + weights.sum(dim=0)
+    def of(cls, part: Callable[[int], TracePart], count: int) -> "Summary":
+        """Return the summary of so many parts, each given by its number."""
+        told = [(one.contrast, one.glare) for one in map(part, range(count))]
         contrast, glare = (torch.cat(one) for one in zip(*told, strict=True))
-        return cls(contrast=contrast, glare=glare, mean_light=total / mass.clamp_min(1e-9))
+        frames = np.flatnonzero(shows_something(contrast, glare).numpy())
+        return cls(contrast=contrast, glare=glare, mean_light=mean_over_places(lambda at: _light_of(part, at), frames))
 
     @property
     def shows(self) -> NDArray[np.bool_]:
         """(T,) bool, frames that show something: not all black, white or even."""
         shown: NDArray[np.bool_] = shows_something(self.contrast, self.glare).numpy()
         return shown
+
+
+def _light_of(part: Callable[[int], TracePart], number: int) -> tuple[Tensor, Tensor]:
+    one, row = part(number // PART), number % PART
+    return one.values[row].mean(dim=1), one.weights[row]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,7 +114,7 @@ class Traces:
     summary : Summary
         Of all frames.
     part : callable
-        Gives each part by its number.
+        Gives each part by its number; it is asked for the same ones again and again.
     """
 
     template: Samples
@@ -126,7 +126,7 @@ class Traces:
         """Return the traces of a recording whose parts can be had, such as from files."""
         template = sample_cores(torch.zeros(1, *source.shape[1:]), bundle, source.acquisition)
         template = replace(template, values=template.values[:0], weights=template.weights[:0])
-        return cls(template=template, summary=summary, part=lru_cache(maxsize=KEPT_PARTS)(part))
+        return cls(template=template, summary=summary, part=part)
 
     def __len__(self) -> int:
         return len(self.summary.contrast)
@@ -157,12 +157,16 @@ def tracing(work: Work, client: Any | None) -> Generator[Doing, None, Traces]:
     units = range(count_parts(work.source))
     for _, left in complete(trace_unit, TRACES, work, units, client):
         yield Doing("reading frames", left=left, units=len(units))
-    Summary.of(TracePart.load(work.path(TRACES, number)) for number in units).save(work.shared(TRACES))
+    if not work.shared(TRACES).exists():
+        Summary.of(_parts_of(work), len(units)).save(work.shared(TRACES))
     return traced(work)
 
 
 @lru_cache(maxsize=2)
 def traced(work: Work) -> Traces:
     """Return the traces that units have left; in one process they share what is in memory."""
-    summary = Summary.load(work.shared(TRACES))
-    return Traces.of(work.source, work.bundle, summary, lambda number: TracePart.load(work.path(TRACES, number)))
+    return Traces.of(work.source, work.bundle, Summary.load(work.shared(TRACES)), _parts_of(work))
+
+
+def _parts_of(work: Work) -> Callable[[int], TracePart]:
+    return lru_cache(maxsize=KEPT_PARTS)(lambda number: TracePart.load(work.path(TRACES, number)))

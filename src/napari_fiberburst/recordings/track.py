@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from napari_fiberburst.coordinates import transform_points
@@ -115,6 +116,25 @@ class Track(Stored):
     def frames_of(self, piece: int) -> NDArray[np.int64]:
         """Return the numbers of a piece's frames."""
         return np.flatnonzero(self.piece == piece)
+
+    def rarity(self, radius: float) -> NDArray[np.float64]:
+        """Return one over how many frames (T,) of its piece lie within a radius of each, pixels, itself included.
+
+        Sums that are weighed by it count each place once, however long the probe has rested there.
+        """
+        rarity = np.zeros(len(self))
+        for piece in range(self.pieces):
+            frames = self.frames_of(piece)
+            middle = self.corners(frames).mean(axis=1)
+            rarity[frames] = 1 / cKDTree(middle).query_ball_point(middle, radius, return_length=True)
+        return rarity
+
+    def spread(self, frames: NDArray[np.int64], count: int, radius: float) -> NDArray[np.int64]:
+        """Return some of a piece's frames, about so many at most, evenly over the places where they lie."""
+        passed = np.cumsum(self.rarity(radius)[frames])
+        at = np.searchsorted(passed, np.linspace(0, passed[-1], count + 1)[1:] - passed[-1] / (2 * count))
+        some: NDArray[np.int64] = frames[np.unique(at)]
+        return some
 
     def bounds(self, piece: int) -> Bounds:
         """Return x0, y0, x1, y1 of all that a piece's frames see."""

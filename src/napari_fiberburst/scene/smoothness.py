@@ -124,14 +124,14 @@ def _expected_error(
     falling = isotonic_regression(common / transfer**2, weights=trust / trust.max(), increasing=False)
     power = np.maximum(falling.x, 0)
     of_samples = noise * stiff**2 / (density * np.maximum(passed, _LEAST_TRANSFER))
-    variance = _weighted_median(of_samples, count * passed)
+    variance = weighted_median(of_samples, count * passed)
     weight = _CANDIDATES[:, None] * prior
     all_stiff = 2 * density * passed + weight
     errors = (weight / all_stiff) ** 2 * power + 2 * density * passed * variance / all_stiff**2
     return np.asarray(errors @ count)
 
 
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Return the value with half of the weight below it."""
     order = np.argsort(values)
     below = np.cumsum(weights[order])
