@@ -259,3 +259,11 @@ def _telling(steps, told):
             return ended.value
         told.append(doing)
         yield doing
+
+
+def test_a_path_gone_time_and_again_is_shown_no_worse_than_gone_once(tmp_path):
+    shown = []
+    for laps in (1, 8):
+        truth = simulate_recording(frames=30 * laps, shape=SHAPE, path="raster", step=5.0, laps=laps, seed=6)
+        shown.append(fidelity(mosaic(truth.source, tmp_path / f"{laps}.ome.zarr"), truth, 0))
+    assert shown[1] > shown[0] - 0.7

@@ -34,17 +34,28 @@ def track():
     )
 
 
-def test_first_frames_lie_on_their_own_pixels(track):
-    np.testing.assert_allclose(track.anchored().scene_from_frame[[0, 1]], np.tile(np.eye(3), (2, 1, 1)), atol=1e-12)
+def turned(matrix):
+    """Return a matrix as the complex turn and growth that are nearest to it."""
+    return (matrix[0, 0] + matrix[1, 1]) / 2 + 1j * (matrix[1, 0] - matrix[0, 1]) / 2
+
+
+def test_first_frames_lie_upright_on_their_own_pixels(track):
+    for first in (0, 1):
+        matrix = track.anchored().scene_from_frame[first]
+        assert turned(matrix) == pytest.approx(1, abs=1e-9)
+        middle = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2, 1])
+        np.testing.assert_allclose(matrix @ middle, middle, atol=1e-9)
 
 
 def test_frames_lie_on_one_another_as_before(track):
     corners = torch.tensor([[0.0, 0.0], [82.0, 13.0], [31.0, 60.0]])
-    before, after = (some.points(np.arange(6), corners).double() for some in (track, track.anchored()))
-    for first, others in ((1, [2, 4]), (0, [5])):
-        to_first = torch.from_numpy(np.linalg.inv(track.scene_from_frame[first]))
-        moved = before[others] @ to_first[:2, :2].T + to_first[:2, 2]
-        torch.testing.assert_close(after[others], moved, rtol=0, atol=1e-4)
+    before, after = (some.points(np.arange(6), corners).double().numpy() for some in (track, track.anchored()))
+    for own in ([1, 2, 4], [0, 5]):
+        was, now = (places[own].reshape(-1, 2) @ [1, 1j] for places in (before, after))
+        basis = np.stack([was, np.ones_like(was)], axis=1)
+        change = np.linalg.lstsq(basis, now, rcond=None)[0]
+        np.testing.assert_allclose(basis @ change, now, atol=1e-4)
+        assert change[0] == pytest.approx(1 / turned(track.scene_from_frame[own[0]]), abs=1e-5)
 
 
 def test_frames_without_a_piece_are_left(track):

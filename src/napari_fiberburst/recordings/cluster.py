@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from napari_fiberburst.errors import ClusterError
-from napari_fiberburst.recordings.refine import TILE_SIDE
+from napari_fiberburst.recordings.refine import TILE_SIDE, halo_of
 from napari_fiberburst.recordings.traces import KEPT_PARTS, PART
 
 # Seconds after which a scheduler that does not answer is not there.
@@ -36,7 +36,7 @@ def unit_memory(shape: tuple[int, int, int, int]) -> int:
     read = _PER_FRAME_BYTE * max(frame, min(_TOGETHER, frame * min(frames, PART)))
     cores = height * width / _PIXELS_PER_CORE
     kept = 4 * cores * (channels + 1) * min(frames, PART * KEPT_PARTS)
-    nodes = (TILE_SIDE + 2 * max(height, width)) ** 2
+    nodes = (TILE_SIDE + 2 * halo_of((height, width))) ** 2
     return int(_FIXED + kept + max(read, _PER_NODE * channels * nodes))
 
 

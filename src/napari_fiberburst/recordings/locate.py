@@ -39,7 +39,8 @@ from napari_fiberburst.stored import Stored
 
 # The bundle is calibrated from so many frames, spread over the recording.
 _CALIBRATED_FROM = 48
-# Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it.
+# Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it. Until
+# then, what is wrong with gains, exposures and long waves would ask for more freedom, too.
 _ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
 # Frames bend where that lowers the error by a part of it.
 _WORTH_BENDING = 0.9
@@ -47,8 +48,6 @@ _WORTH_BENDING = 0.9
 _MOST_MISSED = 4.0
 # Places are doubtful where more than this part of the frames has none, or the median frame is less like the scene.
 _MOST_LOST, _LEAST_ALIKE = 0.25, 0.93
-# Gains and exposures have settled, and scenes are rectified, after so many rounds.
-_SETTLED = 3
 # Degrees of freedom of links: frames of fewer are placed anew where they turn.
 _TURNING = 4
 # The slow changes of the illumination are told by so many frames, spread over the recording.
@@ -137,11 +136,11 @@ def _refining(
         track, settled = rectified(refined(track, parts), parts), settled + 1
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
-        asked = larger_model(track, parts) if is_free and settled >= _SETTLED else track.dof
+        if settled < _ROUNDS or track.error < _WORTH * before.error:
+            continue
+        asked = larger_model(track, parts) if is_free else track.dof
         if asked > track.dof:
             track, settled = _with_freedom(work, track, links, asked), 0
-        elif number + 1 < _ROUNDS or settled < _SETTLED or track.error < _WORTH * before.error:
-            continue
         elif is_free and unbent is None and ask_to_bend(parts):
             unbent, track, settled = track, bending(track), 0
         else:

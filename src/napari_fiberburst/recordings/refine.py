@@ -4,6 +4,7 @@ Pairs of frames leave a tenth of a pixel; the scene knows each place from many f
 against it leaves some hundredths. Scene and frames are found in turn.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -18,7 +19,7 @@ from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.bending import Bend, basis, control_grid
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
 from napari_fiberburst.recordings.step import MODELS, Seen, stepped
-from napari_fiberburst.recordings.tiles import pieces_tiled
+from napari_fiberburst.recordings.tiles import Tile, pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.work import Work
@@ -26,7 +27,9 @@ from napari_fiberburst.scene.smoothness import UNTOLD, weighted_median
 from napari_fiberburst.stored import Stored
 
 # Side of the tiles on which frames are compared with the scene, nodes: all of most mosaics.
-TILE_SIDE = 1024
+TILE_SIDE = 896
+# Nodes about a tile, beyond half of a frame, that the scene has to be right in.
+_MARGIN = 16
 # Iterations of conjugate gradients, at most: the scene has to be good enough to compare frames with.
 _ITERATIONS = 32
 # Residuals beyond so many of their root mean square count less.
@@ -96,7 +99,7 @@ class Refinement(Stored):
 def refine_unit(work: Work, stage: str, number: int) -> None:
     """Compare the frames of one tile with the scene that they and those about them make."""
     track, traces = Track.load(work.shared(stage)), traced(work)
-    piece, tile = pieces_tiled(track, TILE_SIDE, halo=max(track.shape))[number]
+    piece, tile = _tiles(track)[number]
     around = equations(traces, track, track.touching(tile.grid, piece), tile.grid)
     scene = around.solve(UNTOLD, iterations=_ITERATIONS)
     refine(traces, track, tile.of_frames(track, piece), tile.grid, around.through(scene)).save(work.path(stage, number))
@@ -104,7 +107,16 @@ def refine_unit(work: Work, stage: str, number: int) -> None:
 
 def refine_units(track: Track) -> range:
     """Return the numbers of all units of `refine_unit`."""
-    return range(len(pieces_tiled(track, TILE_SIDE, halo=max(track.shape))))
+    return range(len(_tiles(track)))
+
+
+def halo_of(shape: tuple[int, int]) -> int:
+    """Return how many nodes about a tile hold frames (height, width) whose middles lie in it, turned in any way."""
+    return math.ceil(math.hypot(*shape) / 2) + _MARGIN
+
+
+def _tiles(track: Track) -> list[tuple[int, Tile]]:
+    return pieces_tiled(track, TILE_SIDE, halo_of(track.shape))
 
 
 def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, filtered: Tensor) -> Refinement:

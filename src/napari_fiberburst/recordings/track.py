@@ -72,18 +72,30 @@ class Track(Stored):
         return int(self.piece.max(initial=-1)) + 1
 
     def anchored(self) -> "Track":
-        """Return the track with the scene of each piece in the pixels of its first frame, which refining leaves."""
+        """Return the track with the scene of each piece in the pixels of its first frame, which refining leaves.
+
+        By a similarity about the middle of that frame: how the one frame is stretched and bent is not the scene's.
+        """
         matrices = self.scene_from_frame.copy()
         control = None if self.control is None else self.control.copy()
         for piece in range(self.pieces):
             frames = self.frames_of(piece)
             if not len(frames):
                 continue
-            back = np.linalg.inv(matrices[frames[0]])
+            back = self._back_from(int(frames[0]))
             matrices[frames] = back @ matrices[frames]
             if control is not None:
                 control[frames] = back[:2, :2].astype(np.float32) @ control[frames]
         return replace(self, scene_from_frame=matrices, control=control)
+
+    def _back_from(self, number: int) -> NDArray[np.float64]:
+        """Return the similarity (3, 3) that takes the middle of a frame back to where it is in the frame, upright."""
+        (a, b, _), (c, d, _), _ = self.scene_from_frame[number]
+        middle = (np.array(self.shape[::-1]) - 1) / 2
+        back = np.eye(3)
+        back[:2, :2] = np.linalg.inv([[(a + d) / 2, (b - c) / 2], [(c - b) / 2, (a + d) / 2]])
+        back[:2, 2] = middle - back[:2, :2] @ self.corners(np.array([number]))[0].mean(axis=0)
+        return back
 
     def points(self, numbers: NDArray[np.int64], positions: Tensor) -> Tensor:
         """Return where positions (N, 2) of frames lie in their scene, (n, N, 2)."""
