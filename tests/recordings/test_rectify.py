@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.recordings.conftest import SHAPE, middles
+from tests.recordings.conftest import SHAPE, after_similarity, middles
 
+from napari_fiberburst.recordings import locate
 from napari_fiberburst.recordings.rectify import rectified
 from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
 from napari_fiberburst.recordings.track import Track
+from napari_fiberburst.steps import drain
 
 
 def stretch(places):
@@ -141,3 +143,18 @@ def test_a_stretched_recording_comes_back(hand, located):
         missed.append(np.polyfit(place[:, 0], found[:, 0] - place[:, 0], 1)[0])
     assert missed[0] > 0.005
     assert abs(missed[1]) < 0.2 * missed[0]
+
+
+def test_what_makes_the_scene_worse_is_taken_back(hand, located, tmp_path, monkeypatch):
+    def strained(track, parts):
+        matrices = track.scene_from_frame.copy()
+        matrices[:, 0, 2] *= 1.03
+        return replace(track, scene_from_frame=matrices)
+
+    monkeypatch.setattr(locate, "rectified", strained)
+    found = drain(locate.locating(hand.source, tmp_path, bundle=None, dof=2, client=None)).track
+    frames = found.frames_of(0)
+    true = middles(hand.homographies[frames])
+    off = np.abs(after_similarity(middles(found.scene_from_frame[frames]), true)[0] - true)
+    assert np.median(off) < 0.12
+    assert found.error < 1.05 * located.track.error

@@ -42,6 +42,8 @@ _CALIBRATED_FROM = 48
 # Scene and frames are found in turn so many times at least, and as long as that lowers the error by a part of it. Until
 # then, what is wrong with gains, exposures and long waves would ask for more freedom, too.
 _ROUNDS, _MOST_ROUNDS, _WORTH = 3, 20, 0.985
+# A scene that was rectified and then misses more than before by this part was not strained.
+_WORSE = 1.01
 # Frames bend where that lowers the error by a part of it.
 _WORTH_BENDING = 0.9
 # Frames of which the scene misses so many times the usual show something else, or are blurred.
@@ -125,6 +127,7 @@ def _refining(
     Frames may bend where that is worth it: it is tried where they ask for stretches.
     """
     settled, unbent = 0, None
+    unrectified, has_rigid_frames = track, True
     for number in range(_MOST_ROUNDS):
         stage, before = f"refined-{number}", track
         work.begin(stage)
@@ -133,7 +136,12 @@ def _refining(
         for _, left in complete(refine_unit, stage, work, units, client):
             yield Doing("refining", number, _MOST_ROUNDS, left, len(units))
         parts = [Refinement.load(work.path(stage, unit)) for unit in units]
-        track, settled = rectified(refined(track, parts), parts), settled + 1
+        stepped, settled = refined(track, parts), settled + 1
+        if settled > 1 and has_rigid_frames and stepped.error > _WORSE * before.error:
+            # What frames tell is not the scene's: a fixed pattern strains them all alike, or they bend.
+            track, has_rigid_frames = unrectified, False
+            continue
+        unrectified, track = stepped, rectified(stepped, parts) if has_rigid_frames else stepped
         if number == 0 and track.pieces and not work.bundle.gains_known:
             track = _evened(traces, track)
         if settled < _ROUNDS or track.error < _WORTH * before.error:
