@@ -29,7 +29,7 @@ def unit_memory(shape: tuple[int, int, int, int]) -> int:
     Examples
     --------
     >>> unit_memory((2000, 256, 256, 1)) // 2**20
-    1787
+    1622
     """
     frames, height, width, channels = shape
     frame = 4 * height * width * channels
