@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import zarr
 from napari_fiberburst.cli import main
 from napari_fiberburst.errors import BurstError, SettingsError
 from napari_fiberburst.io import open_recording
-from napari_fiberburst.recordings import batch
+from napari_fiberburst.recordings import tasks
 from napari_fiberburst.recordings.batch import read_settings, recordings_in
 from napari_fiberburst.report.batch import write_batch
 from napari_fiberburst.results.batch import Row
@@ -73,10 +74,43 @@ def test_one_that_fails_does_not_stop_the_others_and_is_tried_again(folder, tmp_
         raise BurstError("not asked for")
 
     (folder / "broken.avi").unlink()
-    monkeypatch.setattr(batch, "mosaicking", only_opened)
+    monkeypatch.setattr(tasks, "mosaicking", only_opened)
     assert main(words) == 0
     assert not opened
     assert [row["verdict"] for row in table_of(output)] == ["good", "good"]
+
+
+def test_a_batch_of_videos_has_a_video_and_a_film_of_each(folder, tmp_path):
+    (folder / "broken.avi").unlink()
+    (folder / "clip 10.mkv").unlink()
+    settings = tmp_path / "batch.toml"
+    settings.write_text("[video]\nwindow = 5\nmp4 = true\n")
+    output = tmp_path / "out"
+    words = ["batch", str(folder), "--task", "video", "-o", str(output), "--settings", str(settings)]
+    assert main(words) == 0
+    (row,) = table_of(output)
+    assert row["verdict"] == "good"
+    assert row["facts"].startswith("30 of 30 frames have a place; 5 frames stand behind each")
+    made = output / "clip 9.tif"
+    assert zarr.open_array(made / "video.ome.zarr" / "0", mode="r").shape == (30, 97, 121)
+    assert len(open_recording(made / "video.mp4")) == 30
+    assert (made / "thumbnail.png").stat().st_size > 500
+
+
+@pytest.mark.parametrize(("placed", "verdict"), [(40, "doubtful"), (30, "doubtful"), (9, "bad")])
+def test_a_row_is_called_no_better_than_its_mosaic_calls_itself(folder, tmp_path, monkeypatch, placed, verdict):
+    (folder / "broken.avi").unlink()
+    (folder / "clip 9.tif").unlink()
+    whole = tasks.mosaicking
+
+    def doubted(*given, **named):
+        made = yield from whole(*given, **named)
+        piece = np.where(np.arange(len(made.track)) < placed, 0, -1)
+        return replace(made, track=replace(made.track, piece=piece), quality="doubtful")
+
+    monkeypatch.setattr(tasks, "mosaicking", doubted)
+    assert main(["batch", str(folder), "--task", "mosaic", "-o", str(tmp_path / "out")]) == 0
+    assert [row["verdict"] for row in table_of(tmp_path / "out")] == [verdict]
 
 
 def test_a_batch_of_bursts_has_an_image_of_each(folder, tmp_path):
@@ -100,7 +134,7 @@ def test_settings_are_checked_before_anything_is_opened(tmp_path):
     file = tmp_path / "batch.toml"
     for text, said in (
         ("[mosaic", "cannot be read as TOML"),
-        ("[movie]", r"movie .* is no table that is known; expected \[recording\], \[mosaic\], \[burst\]"),
+        ("[movie]", r"movie .* is no table that is known; expected \[recording\], \[mosaic\], \[video\], \[burst\]"),
         ("[mosaic]\nspeed = 1", "speed is no setting of a mosaic"),
         ("[mosaic]\nmotion = 'wild'", "motion must be one of auto, translation, similarity"),
         ("[recording]\nlevels = 1", "expected axes, black_level, white_level"),
@@ -108,6 +142,14 @@ def test_settings_are_checked_before_anything_is_opened(tmp_path):
         file.write_text(text)
         with pytest.raises(SettingsError, match=said):
             read_settings(file, "mosaic")
+    for text, said in (
+        ("window = 0", "window must be a number of frames, at least 1; got 0"),
+        ("stabilised = 1", "stabilised must be true or false; got 1"),
+        ("regions = 'x.tif'", "regions is no setting of a video; known ones are bundle, motion, window"),
+    ):
+        file.write_text(f"[video]\n{text}")
+        with pytest.raises(SettingsError, match=said):
+            read_settings(file, "video")
     file.write_text("[burst]\nsmoothnes = 1")
     with pytest.raises(SettingsError, match="smoothnes"):
         read_settings(file, "burst")
@@ -132,7 +174,7 @@ def test_a_full_disk_stops_the_batch(folder, tmp_path, capsys, monkeypatch):
         raise OSError(28, "No space left on device")
         yield
 
-    monkeypatch.setattr(batch, "mosaicking", full)
+    monkeypatch.setattr(tasks, "mosaicking", full)
     (folder / "broken.avi").unlink()
     assert main(["batch", str(folder), "--task", "mosaic", "-o", str(tmp_path / "out")]) == 2
     assert "is full; make room" in capsys.readouterr().err

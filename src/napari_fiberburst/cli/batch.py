@@ -11,7 +11,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.report.batch import write_batch
 from napari_fiberburst.results.batch import Row, write_table
 
-TASKS = ("mosaic", "burst")
+TASKS = ("mosaic", "video", "burst")
 
 
 def add_to(commands: Any) -> None:
@@ -19,8 +19,8 @@ def add_to(commands: Any) -> None:
     parser: argparse.ArgumentParser = commands.add_parser(
         "batch",
         help="do the same with every recording of a folder",
-        description="Make a mosaic, or one image of a good burst, of every recording of a folder, and a report of all: "
-        "report.html and table.csv. A batch that was cut short goes on where it is given again.",
+        description="Make a mosaic, a video, or one image of a good burst, of every recording of a folder, and a "
+        "report of all: report.html and table.csv. A batch that was cut short goes on where it is given again.",
     )
     parser.add_argument("folder", type=Path, help="with videos, TIFF stacks, OME-Zarr or folders of frames in it")
     parser.add_argument("--task", choices=TASKS, required=True, help="what to make of each recording")

@@ -3,17 +3,14 @@
 import time
 import tomllib
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
-from numpy.typing import NDArray
 from PIL import Image
 
 from napari_fiberburst.bundle.bundle import Bundle
-from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import BurstError, ClusterError, FullDiskError, SettingsError
 from napari_fiberburst.io import open_recording
 from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
@@ -23,96 +20,18 @@ from napari_fiberburst.io.results import write_whole
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
 from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.io.zarr import is_zarr
-from napari_fiberburst.pipeline.choose import best_burst
-from napari_fiberburst.pipeline.reconstruct import as_bundle, reconstruct
-from napari_fiberburst.recordings.mosaic import mosaicking
+from napari_fiberburst.pipeline.reconstruct import as_bundle
 from napari_fiberburst.recordings.outputs import identity
+from napari_fiberburst.recordings.tasks import TASKS, Made, Settings
 from napari_fiberburst.recordings.work import Doing, claim, room
 from napari_fiberburst.results.batch import Row
-from napari_fiberburst.settings import choose
-from napari_fiberburst.settings.freedom import FREEDOM
 
 _ENDINGS = (*TIFF_ENDINGS, *VIDEO_ENDINGS, *ARCHIVE_ENDINGS)
 # Longer side of a thumbnail, pixels.
 _THUMBNAIL = 192
-# A mosaic of more than this part of the frames that show something is good; of less than that, bad.
-_MOST_PLACED, _LEAST_PLACED = 0.9, 0.5
 # What one recording alone can fail by; others go on.
 _FAILURES = (ValueError, OSError, RuntimeError, LookupError, ArithmeticError, MemoryError)
 
-Settings = Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Made:
-    """What a task has made of a recording."""
-
-    outputs: tuple[Path, ...]
-    verdict: str
-    notes: tuple[str, ...]
-    facts: tuple[str, ...]
-    picture: NDArray[np.floating]
-
-
-def _mosaic(
-    source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
-) -> Generator[Doing, None, Made]:
-    dof = FREEDOM[settings.get("motion", "auto")]
-    made = yield from mosaicking(source, folder / "mosaic.ome.zarr", bundle=bundle, dof=dof, client=client)
-    placed, count = int((made.track.piece == 0).sum()), len(made.track)
-    part = placed / count
-    verdict = "good" if part >= _MOST_PLACED else "doubtful" if part >= _LEAST_PLACED else "bad"
-    group = zarr.open_group(made.paths[0], mode="r")
-    coarsest = np.asarray(group[str(sum(1 for _ in group.array_keys()) - 1)])
-    facts = [f"{placed} of {count} frames in the picture"]
-    if made.resolution is not None:
-        facts.append(f"resolves periods of {made.resolution:.1f} px")
-    return Made(
-        outputs=(*made.paths, made.poses),
-        verdict=verdict,
-        notes=made.notes,
-        facts=tuple(facts),
-        picture=np.moveaxis(coarsest, 0, -1) if coarsest.ndim == 3 else coarsest,
-    )
-
-
-def _burst(
-    source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
-) -> Generator[Doing, None, Made]:
-    choices = dict(settings)
-    chosen = best_burst(source, choices.pop("frames", 20))
-    yield Doing("reconstructing", left=1)
-    result = reconstruct(source.burst(chosen), bundle=bundle, **choices)
-    path = result.save(folder / "image.ome.tif")
-    return Made(
-        outputs=(path,),
-        verdict=result.quality or "not judged",
-        notes=tuple(result.notes),
-        facts=(f"frames {chosen.start} to {chosen.stop - 1} of {len(source)}",),
-        picture=result.image,
-    )
-
-
-def _check_mosaic(settings: Settings) -> None:
-    for name in settings:
-        if name != "motion":
-            raise SettingsError(f"{name} is no setting of a mosaic; known ones are bundle and motion")
-    if settings.get("motion", "auto") not in FREEDOM:
-        raise SettingsError(f"motion must be one of {', '.join(FREEDOM)}; got {settings['motion']!r}")
-
-
-def _check_burst(settings: Settings) -> None:
-    frames = settings.get("frames", 20)
-    if not isinstance(frames, int) or frames < 2:
-        raise SettingsError(f"frames must be a number of frames, at least 2; got {frames!r}")
-    choose(**{name: value for name, value in settings.items() if name != "frames"})
-
-
-# What can be done with every recording: what does it, and what refuses settings beforehand.
-TASKS: dict[str, tuple[Callable[..., Generator[Doing, None, Made]], Callable[[Settings], None]]] = {
-    "mosaic": (_mosaic, _check_mosaic),
-    "burst": (_burst, _check_burst),
-}
 _OPENING = ("axes", "black_level", "white_level")
 
 

@@ -4,7 +4,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,8 @@ class Video:
         How many frames stand behind each.
     notes : tuple of str
         What a user should know.
+    quality : str
+        "good", or "doubtful" where the notes say why frames may lie wrong.
     """
 
     path: Path
@@ -71,6 +73,7 @@ class Video:
     track: Track
     window: int
     notes: tuple[str, ...]
+    quality: Literal["good", "doubtful"]
 
 
 def video(
@@ -221,6 +224,7 @@ def _written(plan: Plan, located: Located, target: Path) -> Video:
         track=plan.track,
         window=plan.window,
         notes=(*located.notes, *_remarks(plan)),
+        quality=located.quality,
     )
 
 
