@@ -58,13 +58,15 @@ def _together(track: Track, frames: NDArray[np.int64]) -> Iterator[NDArray[np.in
     """Return frames in parts that lie on one piece and see no more than fits into memory."""
     most = _FIELDS * track.shape[0] * track.shape[1]
     some: list[int] = []
+    seen: Grid | None = None
     for number in frames[np.argsort(track.piece[frames], kind="stable")].tolist():
-        views = [view_of(track, other, 0.0) for other in (*some, number)]
-        rows, columns = union(views).shape
-        if some and (track.piece[number] != track.piece[some[0]] or rows * columns > most):
+        view = view_of(track, number, 0.0)
+        both = view if seen is None else union([seen, view])
+        if some and (track.piece[number] != track.piece[some[0]] or both.shape[0] * both.shape[1] > most):
             yield np.array(some)
-            some = []
+            some, both = [], view
         some.append(number)
+        seen = both
     if some:
         yield np.array(some)
 
