@@ -64,7 +64,7 @@ docs: .venv/docs
 # What the site shows of the examples, and of the latest `make bench`. Rows that were not measured anew stay; only some
 # tables: make docs-results MORE="--tables 1 2"
 docs-images: .venv/bench
-	cd docs/gallery && for name in read_the_evidence as_recorded where_it_fails wide_mosaic; do \
+	cd docs/gallery && for name in read_the_evidence as_recorded where_it_fails wide_mosaic clean_video; do \
 	  ../../$(BIN)/python ../../examples/$$name.py || exit 1; done
 	mkdir -p docs/gallery/stages && cd docs/gallery/stages && ../../../$(BIN)/python ../../../examples/draw_the_stages.py
 	for pair in first:your_first_burst trust:can_i_trust_it published:as_published; do \

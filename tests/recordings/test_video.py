@@ -16,6 +16,7 @@ from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.recordings import stretch as stretches
 from napari_fiberburst.recordings import video as pipeline
 from napari_fiberburst.recordings.locate import locating
+from napari_fiberburst.recordings.stretch import near_cores
 from napari_fiberburst.recordings.traces import traced
 from napari_fiberburst.simulation import simulate_recording
 from napari_fiberburst.steps import drain
@@ -93,6 +94,16 @@ def test_frames_are_as_good_as_bursts_of_the_same_frames(still, of_still):
         others = [other for other in range(number - 7, number + 8) if other != number]
         alone = reconstruct(still.source.burst([number, *others]), device="cpu")
         assert psnr(frames[number], truth) > psnr(alone.image, truth) - 0.5
+
+
+def test_no_pixel_is_left_out_where_one_core_is_missing():
+    y, x = np.mgrid[2:60:4.0, 2:80:4.0]
+    centres = np.stack([x.ravel(), y.ravel()], axis=1)
+    gone = np.hypot(*(centres - (42, 30)).T) < 1
+    pixels = np.stack(np.meshgrid(np.arange(81.0), np.arange(61.0)), axis=-1)
+    assert near_cores(pixels, centres[~gone], 3.5).all()
+    wide = np.hypot(*(centres - (42, 30)).T) < 13
+    assert not near_cores(pixels, centres[~wide], 3.5)[30, 42]
 
 
 def test_frames_at_the_ends_have_neighbours_too(still, of_still):

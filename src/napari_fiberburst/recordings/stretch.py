@@ -1,5 +1,6 @@
 """Some frames of a video in a row, each solved from those about it, one after the other."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -8,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from skimage.morphology import remove_small_holes
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import sample_cores
@@ -110,7 +112,7 @@ class _Stretch:
         height, width = track.shape
         rows, columns = np.indices((height, width), dtype=np.float64)
         self._pixels = np.stack([columns, rows], axis=-1)
-        self._is_seen = _near_cores(self._pixels, work.bundle.centres, _REACH * work.bundle.pitch)
+        self._is_seen = near_cores(self._pixels, work.bundle.centres, _REACH * work.bundle.pitch)
 
     def placed(self, frame: int) -> NDArray[np.float32]:
         """Return a frame that has a place, (C, H, W) in [0, 1] above black."""
@@ -200,8 +202,9 @@ def _moved(grid: Grid, scene: Tensor, other: Grid) -> Tensor:
     return scene[:, rows][:, :, columns]
 
 
-def _near_cores(pixels: NDArray[np.float64], centres: NDArray[np.floating], reach: float) -> NDArray[np.bool_]:
-    """Return which pixels (H, W, 2) lie near a core, (H, W)."""
+def near_cores(pixels: NDArray[np.float64], centres: NDArray[np.floating], reach: float) -> NDArray[np.bool_]:
+    """Return which pixels (H, W, 2) lie near a core, (H, W), or where one core is missing among others."""
     distance, _ = cKDTree(centres).query(pixels.reshape(-1, 2), distance_upper_bound=reach)
     near: NDArray[np.bool_] = np.isfinite(distance).reshape(pixels.shape[:2])
-    return near
+    filled: NDArray[np.bool_] = remove_small_holes(near, max_size=math.ceil(reach**2))
+    return filled
