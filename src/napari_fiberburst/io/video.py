@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.lazy import Handle, Parts
+from napari_fiberburst.io.pyav import import_av
 from napari_fiberburst.io.recording import Recording
-from napari_fiberburst.io.video_container import import_av
 from napari_fiberburst.io.video_decoder import Decoder
 from napari_fiberburst.io.video_index import VideoIndex, index_video
 
@@ -132,7 +132,7 @@ def find_frames(path: Path) -> VideoIndex:
 
 def _seen_in(index: VideoIndex, handle: Handle[Decoder]) -> _Pixels:
     """Return how pixels are taken: in grey where the format, or a sample of frames, has no colours."""
-    av = import_av(index.path)
+    av = import_av(f"reading {index.path}")
     if all(part.is_luma for part in av.VideoFormat(index.pixels).components):
         return _Pixels.of(av, index.pixels, is_grey=True)
     colours = _Pixels.of(av, index.pixels, is_grey=False)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.pyav import import_av
 
 VIDEO_ENDINGS = (
     *(".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".m1v", ".m2v", ".ts", ".mts", ".m2ts"),
@@ -17,23 +18,6 @@ _CODEC_NAME = re.compile(rb"strh.{4}vids(.{4})|stsd.{12}(?!mp4a)(\w{4})|(V_[A-Z0
 _SEARCHED = 2**20
 
 
-def import_av(path: Path) -> Any:
-    """Return PyAV, which reads the file at `path`.
-
-    Raises
-    ------
-    BurstError
-        It is not installed.
-    """
-    try:
-        import av
-    except ImportError as error:
-        raise BurstError(
-            f"reading {path} needs the package av; install it by: pip install 'napari-fiberburst[recordings]'"
-        ) from error
-    return av
-
-
 def open_video(path: Path) -> tuple[Any, Any]:
     """Return a video file, open, and its first video stream.
 
@@ -42,7 +26,7 @@ def open_video(path: Path) -> tuple[Any, Any]:
     BurstError
         It is empty, no video, without pictures, or of a codec that is missing.
     """
-    av = import_av(path)
+    av = import_av(f"reading {path}")
     if path.stat().st_size == 0:
         raise BurstError(f"{path} is empty; copy or export it again")
     try:
@@ -68,7 +52,7 @@ def open_video(path: Path) -> tuple[Any, Any]:
 
 def packets_of(container: Any, stream: Any) -> Iterator[Any]:
     """Return the packets of a stream that hold something, from where the file stands to its end or its first hole."""
-    av = import_av(Path(container.name))
+    av = import_av(f"reading {container.name}")
     try:
         for packet in container.demux(stream):
             if packet.size:
@@ -90,7 +74,7 @@ def decode(stream: Any, packets: Iterable[tuple[int, Any]]) -> Iterator[tuple[in
 
 
 def _frames(stream: Any, packet: Any) -> Iterator[tuple[int, Any]]:
-    av = import_av(Path())
+    av = import_av("reading a video")
     try:
         frames = stream.decode(packet)
     except av.error.FFmpegError:

@@ -6,7 +6,8 @@ from itertools import chain, islice
 from typing import Any
 
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.io.video_container import decode, import_av, open_video, packets_of
+from napari_fiberburst.io.pyav import import_av
+from napari_fiberburst.io.video_container import decode, open_video, packets_of
 from napari_fiberburst.io.video_index import Packet, VideoIndex
 
 logger = logging.getLogger(__name__)
@@ -110,7 +111,7 @@ class Decoder:
         """Enter the file at a time, and return the packets from a key frame on; None where it does not come."""
         try:
             self._container.seek(time, stream=self._stream, backward=True)
-        except import_av(self._index.path).error.FFmpegError:
+        except import_av(f"reading {self._index.path}").error.FFmpegError:
             return None
         packets = packets_of(self._container, self._stream)
         for packet in islice(packets, most):

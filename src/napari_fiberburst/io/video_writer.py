@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.pyav import import_av
 from napari_fiberburst.io.results import write_whole
 
 # Frames per second where nothing is known of their times.
@@ -103,12 +104,7 @@ def write_video(
     """
     target = Path(path)
     container, chosen = _container(target, codec, source)
-    try:
-        import av
-    except ImportError as error:
-        raise OutputError(
-            f"writing {target} needs the package av; install it by: pip install 'napari-fiberburst[recordings]'"
-        ) from error
+    av = import_av(f"writing {target}", OutputError)
     shown = _times(source, rate, container)
     with write_whole(target) as file:
         try:
@@ -178,8 +174,7 @@ def _times(source: FrameSource, rate: float | None, container: str) -> _Times:
 
 def _encode(output: Any, source: FrameSource, codec: _Codec, shown: "_Times", on_frame: Callable[[], object]) -> None:
     """Encode all frames into an open container."""
-    import av
-
+    av = import_av("writing a video", OutputError)
     _, height, width, channels = source.shape
     depth = 2 if (channels, 2) in codec.layouts and source.acquisition.dtype.itemsize > 1 else 1
     even = 2 if codec.layouts[channels, depth] == "yuv420p" else 1

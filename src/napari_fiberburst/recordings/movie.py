@@ -13,6 +13,7 @@ from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.picture import as_picture, limits_of
+from napari_fiberburst.io.pyav import import_av
 from napari_fiberburst.io.results import check_place
 from napari_fiberburst.io.video_writer import VIDEO_ENDINGS, write_video
 
@@ -33,12 +34,7 @@ def check_movie(path: str | Path) -> Path:
     target = Path(path)
     if target.suffix.lower() not in VIDEO_ENDINGS:
         raise OutputError(f"a video file ends in {', '.join(VIDEO_ENDINGS)}; got {target}")
-    try:
-        import av  # noqa: F401
-    except ImportError as error:
-        raise OutputError(
-            f"writing {target} needs the package av; install it by: pip install 'napari-fiberburst[recordings]'"
-        ) from error
+    import_av(f"writing {target}", OutputError)
     check_place(target)
     return target
 
