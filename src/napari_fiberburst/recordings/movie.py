@@ -1,17 +1,17 @@
-"""A video file to look at, of an OME-Zarr video: 8 bits, at a contrast that shows it well."""
+"""A video file to look at, of any stack: 8 bits, at a contrast that shows it well."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io import open_recording
 from napari_fiberburst.io.picture import as_picture, limits_of
 from napari_fiberburst.io.pyav import import_av
 from napari_fiberburst.io.results import check_place
@@ -39,66 +39,73 @@ def check_movie(path: str | Path) -> Path:
     return target
 
 
-def write_movie(path: Path, target: Path, acquisition: Acquisition, *, scale_bar: bool) -> Path:
-    """Write an OME-Zarr video as a video file.
+def film_source(path: Path, acquisition: Acquisition) -> FrameSource:
+    """Return the frames of an OME-Zarr video, at the exact times of the recording that it was made of."""
+    source = open_recording(path, black_level=0, white_level=1)  # no level is looked for: frames may be NaN
+    known = Acquisition.from_dict(source.acquisition.to_dict())
+    return replace(source, acquisition=replace(known, times=acquisition.times))
+
+
+def write_movie(source: FrameSource, target: Path, *, scale_bar: bool) -> Path:
+    """Write a stack as a video file.
 
     Parameters
     ----------
-    path : Path
-        The OME-Zarr video.
+    source : FrameSource
+        Any that `open_recording` opens, (T, H, W, C). NaN is shown black.
     target : Path
         Ending in one of `VIDEO_ENDINGS`.
-    acquisition : Acquisition
-        Of the recording that it was made of: its times and the size of a pixel.
     scale_bar : bool
         Whether to draw one, where the size of a pixel is known.
+
+    Raises
+    ------
+    OutputError
+        There is one frame alone, or the file cannot be written.
     """
-    level = zarr.open_array(path / "0", mode="r")
-    count, (height, width) = level.shape[0], level.shape[-2:]
+    count, height, width, channels = source.shape
+    if count < 2:
+        raise OutputError(f"{source.name} has one frame; a film needs a time axis of two or more")
     some = np.unique(np.linspace(0, count - 1, _TOLD_BY).astype(int)).tolist()
-    limits = limits_of(np.stack([np.asarray(level[number]) for number in some]))
-    channels = 3 if level.ndim == 4 and level.shape[1] == 3 else 1
-    size = acquisition.pixel_size
-    bar = _bar_of(size[1], width) if scale_bar and size is not None else 0
+    limits = limits_of(source.recorded(some).astype(np.float32))
+    size = source.acquisition.pixel_size
     known = replace(
-        Acquisition.from_dict(acquisition.to_dict()),
-        shape=(count, height, width, channels),
-        axes="TYX" if channels == 1 else "TYXC",
+        Acquisition.from_dict(source.acquisition.to_dict()),
+        shape=(count, height, width, 3 if channels == 3 else 1),
+        axes="TYXC" if channels == 3 else "TYX",
         dtype=np.dtype(np.uint8),
         black_level=0.0,
         white_level=255.0,
         channel_names=(),
     )
-    reader = _Frames(str(path), limits, bar)
-    return write_video(FrameSource(acquisition=known, reader=reader, name=str(path), fingerprint=str(path)), target)
+    bar = _bar_of(size[1], width) if scale_bar and size is not None else 0
+    return write_video(replace(source, acquisition=known, reader=_Frames(source, limits, bar)), target)
 
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """Reads frames of an OME-Zarr video as pictures to look at; black where nothing is known.
+    """Reads frames of a stack as pictures to look at; black where nothing is known.
 
     Attributes
     ----------
-    path : str
-        Of the video.
+    source : FrameSource
+        The stack.
     limits : (float, float)
         What is shown black and white.
     bar : int
         Pixels of the scale bar; 0 for none.
     """
 
-    path: str
+    source: FrameSource
     limits: tuple[float, float]
     bar: int
 
     def __call__(self, numbers: Sequence[int]) -> NDArray[np.uint8]:
         """Return frames (n, H, W, 1 or 3)."""
-        level = zarr.open_array(Path(self.path) / "0", mode="r")
-        return np.stack([self._drawn(np.asarray(level[number])) for number in numbers])
+        return np.stack([self._drawn(self.source.recorded([number])[0].astype(np.float32)) for number in numbers])
 
     def _drawn(self, frame: NDArray[np.float32]) -> NDArray[np.uint8]:
-        image = frame if frame.ndim == 2 else np.moveaxis(frame, 0, -1)
-        image = image.mean(axis=2) if image.ndim == 3 and image.shape[2] != 3 else image
+        image = frame if frame.shape[2] == 3 else frame.mean(axis=2)
         shown = as_picture(np.nan_to_num(image, nan=self.limits[0]), self.limits)
         if self.bar:
             shown = _with_bar(shown, self.bar)

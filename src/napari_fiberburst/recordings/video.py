@@ -15,7 +15,7 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io.pyramid import create_pyramid
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
-from napari_fiberburst.recordings.movie import check_movie, write_movie
+from napari_fiberburst.recordings.movie import check_movie, film_source, write_movie
 from napari_fiberburst.recordings.outputs import (
     ENDING,
     OME_UNITS,
@@ -191,7 +191,7 @@ def videoing(
         made = _written(plan, located, target)
         if mp4 is not None:
             yield Doing("writing the film", left=1)
-            movie = write_movie(target, Path(mp4), source.acquisition, scale_bar=scale_bar)
+            movie = write_movie(film_source(target, source.acquisition), Path(mp4), scale_bar=scale_bar)
             made = replace(made, movie=movie)
         finish(folder)
         return made

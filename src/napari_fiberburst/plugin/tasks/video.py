@@ -123,6 +123,6 @@ class VideoTask(LongTask):
 
 
 def _written(video: Path, acquisition: Acquisition, target: Path) -> Path:
-    from napari_fiberburst.recordings.movie import check_movie, write_movie
+    from napari_fiberburst.recordings.movie import check_movie, film_source, write_movie
 
-    return write_movie(video, check_movie(target), acquisition, scale_bar=True)
+    return write_movie(film_source(video, acquisition), check_movie(target), scale_bar=True)
