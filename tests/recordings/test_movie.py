@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 import tifffile
+import zarr
 
 from napari_fiberburst import open_recording
 from napari_fiberburst.cli import main
+from napari_fiberburst.io.pyramid import create_pyramid
 
 
 @pytest.fixture
@@ -27,10 +29,28 @@ def test_a_stack_with_nan_and_odd_sides_becomes_a_film(stack, tmp_path):
     assert np.corrcoef(film[:, :61, 8:83].ravel(), frames[:, :, 8:].ravel())[0, 1] > 0.99
 
 
+def test_a_video_with_nan_has_a_scale_bar_where_a_pixel_has_a_size(stack, tmp_path):
+    frames = stack[1].astype(np.float32)
+    for name, size in (("known", (0.5, 0.5)), ("unknown", None)):
+        path = tmp_path / f"{name}.ome.zarr"
+        create_pyramid(
+            path, frames.shape, name=name, pixel_size=size, unit="micrometer", channels=(), times=None, is_video=True
+        )
+        zarr.open_array(path / "0", mode="r+")[:] = frames
+        assert main(["film", str(path), "-o", str(tmp_path / f"{name}.mkv")]) == 0
+    known, unknown = (
+        open_recording(tmp_path / f"{name}.mkv").recorded([2])[0, ..., 0] for name in ("known", "unknown")
+    )
+    # A quarter of 83 pixels of 0.5 is 10.4: the bar is 10 long, 20 pixels, and 2 high.
+    rows, columns = np.nonzero(known != unknown)
+    assert (np.ptp(rows) + 1, np.ptp(columns) + 1) == (2, 20)
+    assert (known[known != unknown] == 255).all()
+
+
 def test_what_makes_no_film_is_said(stack, tmp_path, capsys):
     path, frames = stack
     single = tmp_path / "single.tif"
-    tifffile.imwrite(single, frames[:1].astype(np.float32), metadata={"axes": "TYX"})
+    tifffile.imwrite(single, frames[0].astype(np.float32), metadata={"axes": "YX"})
     there = tmp_path / "there.mp4"
     there.write_bytes(b"mine")
     for given, output, said in (
