@@ -114,6 +114,13 @@ def test_what_is_not_told_stays(path):
     assert off(found, path).max() < 5e-3
 
 
+def test_a_piece_that_has_lost_its_frames_is_no_hindrance(path):
+    wrong = replace(track_of(path + stretch(path), 2), piece=np.ones(len(path), np.int64))
+    found = rectified(wrong, [told(wrong, strain_at(path), 1e10)])
+    assert off(found, path).max() < 0.01
+    assert (found.rarity(4.0) == 1).all()
+
+
 def test_frames_that_stretch_tell_nothing(path):
     track = track_of(path, 6)
     assert rectified(track, [told(track, strain_at(path), 1e10)]) is track

@@ -127,7 +127,7 @@ def _refining(
     Frames may bend where that is worth it: it is tried where they ask for stretches.
     """
     settled, unbent = 0, None
-    unrectified, has_rigid_frames = track, True
+    unrectified, is_rectified = track, True
     for number in range(_MOST_ROUNDS):
         stage, before = f"refined-{number}", track
         work.begin(stage)
@@ -137,13 +137,13 @@ def _refining(
             yield Doing("refining", number, _MOST_ROUNDS, left, len(units))
         parts = [Refinement.load(work.path(stage, unit)) for unit in units]
         stepped, settled = refined(track, parts), settled + 1
-        if settled > 1 and has_rigid_frames and stepped.error > _WORSE * before.error:
+        if settled > 1 and is_rectified and stepped.error > _WORSE * before.error:
             # What frames tell is not the scene's: a fixed pattern strains them all alike, or they bend.
-            track, has_rigid_frames = unrectified, False
+            track, is_rectified = unrectified, False
             continue
-        unrectified, track = stepped, rectified(stepped, parts) if has_rigid_frames else stepped
-        if number == 0 and track.pieces and not work.bundle.gains_known:
-            track = _evened(traces, track)
+        if number == 0 and len(stepped.frames_of(0)) and not work.bundle.gains_known:
+            stepped = _evened(traces, stepped)
+        unrectified, track = stepped, rectified(stepped, parts) if is_rectified else stepped
         if settled < _ROUNDS or track.error < _WORTH * before.error:
             continue
         asked = larger_model(track, parts) if is_free else track.dof

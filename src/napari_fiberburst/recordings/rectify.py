@@ -35,6 +35,8 @@ def rectified(track: Track, parts: Sequence[Refinement]) -> Track:
     matrices = track.scene_from_frame.copy()
     for piece in range(track.pieces):
         frames = track.frames_of(piece)
+        if not len(frames):
+            continue
         back = _back(track.corners(frames).mean(axis=1), strain[frames], certainty[frames], is_rigid=track.dof == 2)
         matrices[frames] = back @ matrices[frames]
     return replace(track, scene_from_frame=matrices)
