@@ -12,6 +12,7 @@ from napari_fiberburst.recordings.links import Linker
 from napari_fiberburst.recordings.locate import bundle_of, locating
 from napari_fiberburst.recordings.mosaic import mosaic
 from napari_fiberburst.recordings.outputs import identity
+from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
 from napari_fiberburst.recordings.traces import traced, tracing
 from napari_fiberburst.recordings.views import Views, middle_of
 from napari_fiberburst.recordings.work import Work, claim
@@ -77,6 +78,20 @@ class Turning:
 def turning(tmp_path_factory):
     """Return a recording of a hand that turns, with a linker of its frames."""
     return Turning(tmp_path_factory.mktemp("turning"))
+
+
+def refine_in_turn(work, track, rounds, name, finish=lambda track, parts: track):
+    """Return a track after so many rounds of refining, each finished by a function of the track and its parts."""
+    for number in range(rounds):
+        stage = f"{name}-{number}"
+        work.begin(stage)
+        track.save(work.shared(stage))
+        units = refine_units(track)
+        for unit in units:
+            refine_unit(work, stage, unit)
+        parts = [Refinement.load(work.path(stage, unit)) for unit in units]
+        track = finish(refined(track, parts), parts)
+    return track
 
 
 def middles(matrices):

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.recordings.conftest import SHAPE, after_similarity, middles
+from tests.recordings.conftest import SHAPE, after_similarity, middles, refine_in_turn
 
 from napari_fiberburst.recordings import locate
 from napari_fiberburst.recordings.rectify import rectified
-from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
+from napari_fiberburst.recordings.refine import Refinement
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.steps import drain
 
@@ -137,15 +137,7 @@ def test_a_stretched_recording_comes_back(hand, located):
     place = true[:, :2, 2]
     missed = []
     for name, finish in (("stretched", lambda track, parts: track), ("rectified", rectified)):
-        track = start
-        for number in range(3):
-            stage = f"{name}-{number}"
-            located.work.begin(stage)
-            track.save(located.work.shared(stage))
-            for unit in refine_units(track):
-                refine_unit(located.work, stage, unit)
-            parts = [Refinement.load(located.work.path(stage, unit)) for unit in refine_units(track)]
-            track = finish(refined(track, parts), parts)
+        track = refine_in_turn(located.work, start, 3, name, finish)
         found = track.scene_from_frame[frames, :2, 2]
         missed.append(np.polyfit(place[:, 0], found[:, 0] - place[:, 0], 1)[0])
     assert missed[0] > 0.005

@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.recordings.conftest import after_similarity, middles
-
-from napari_fiberburst.recordings.refine import Refinement, refine_unit, refine_units, refined
+from tests.recordings.conftest import after_similarity, middles, refine_in_turn
 
 
 @pytest.fixture(scope="module")
@@ -30,15 +28,7 @@ def disturbed(hand, located):
     gains = (known.gains * np.exp(rng.normal(0, 0.08, known.gains.shape))).astype(np.float32)
     exposures = (true.exposures * np.exp(rng.normal(0, 0.06, len(known)))).astype(np.float32)
     start = replace(true, scene_from_frame=moved, gains=gains, exposures=exposures)
-    track = start
-    for number in range(5):
-        stage = f"disturbed-{number}"
-        located.work.begin(stage)
-        track.save(located.work.shared(stage))
-        for unit in refine_units(track):
-            refine_unit(located.work, stage, unit)
-        parts = [Refinement.load(located.work.path(stage, unit)) for unit in refine_units(track)]
-        track = refined(track, parts)
+    track = refine_in_turn(located.work, start, 5, "disturbed")
     return true, start, track, frames
 
 
