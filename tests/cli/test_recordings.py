@@ -7,6 +7,7 @@ from tests.io.clips import drawn, write_clip
 
 from napari_fiberburst import Bundle, open_recording, read_burst
 from napari_fiberburst.cli import main
+from napari_fiberburst.recordings import video
 from napari_fiberburst.simulation import simulate
 
 
@@ -123,3 +124,45 @@ def test_every_frame_of_a_video_is_reconstructed(tmp_path, monkeypatch, capsys, 
     (tmp_path / "no.tif").write_text("no labels")
     assert main([*command[:3], "b.ome.zarr", "--regions", "no.tif"]) == 2
     assert "no.tif cannot be read as a label image" in capsys.readouterr().err
+
+
+@pytest.fixture
+def short(tmp_path, monkeypatch, frames):
+    """Return the command that makes a video and a film of 12 frames."""
+    monkeypatch.chdir(tmp_path)
+    write_clip(tmp_path / "a.mkv", "ffv1", "gray", list(frames[:12]), group=6)
+    return ["video", "a.mkv", "-o", "a.ome.zarr", "--window", "5", "--mp4", "a.mp4"]
+
+
+def test_a_film_that_is_there_is_replaced_only_where_that_is_asked_for(short, tmp_path, capsys):
+    film = tmp_path / "a.mp4"
+    film.write_bytes(b"mine")
+    assert main(short) == 2
+    assert "a.mp4 is there already; choose another name, remove it, or replace it by --ov" in capsys.readouterr().err
+    assert film.read_bytes() == b"mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mkv", "a.mp4"]  # no work was begun
+    assert main([*short, "--overwrite"]) == 0
+    assert len(open_recording(film)) == 12
+    assert main([*short[:-1], "a.mkv", "--overwrite"]) == 2
+    assert "a.mkv is what the result is made from, and would be lost" in capsys.readouterr().err
+    assert len(open_recording("a.mkv")) == 12
+
+
+def test_a_run_goes_on_with_its_own_film_and_not_with_another(short, tmp_path, monkeypatch, capsys):
+    film = tmp_path / "a.mp4"
+    with monkeypatch.context() as patched:
+        patched.setattr(video, "finish", interrupted)  # after all is written
+        with pytest.raises(SystemExit):
+            main(short)
+    assert len(open_recording(film)) == 12
+    (tmp_path / "b.mp4").write_bytes(b"mine")
+    assert main([*short[:-1], "b.mp4"]) == 2
+    assert "b.mp4 is there already" in capsys.readouterr().err
+    assert (tmp_path / "b.mp4").read_bytes() == b"mine"
+    assert main(short) == 0
+    assert len(open_recording(film)) == 12
+    assert not (tmp_path / "a.work").exists()
+
+
+def interrupted(folder):
+    raise KeyboardInterrupt

@@ -54,10 +54,22 @@ def test_what_makes_no_film_is_said(stack, tmp_path, capsys):
     there = tmp_path / "there.mp4"
     there.write_bytes(b"mine")
     for given, output, said in (
-        (path, there, "is there already; choose another name"),
+        (path, there, "is there already; choose another name, remove it, or replace it by --overwrite"),
         (path, tmp_path / "a.gif", "a video file ends in .avi, .mkv, .mp4"),
         (single, tmp_path / "a.mp4", "has one frame; a film needs a time axis"),
     ):
         assert main(["film", str(given), "-o", str(output)]) == 2
         assert said in capsys.readouterr().err
     assert there.read_bytes() == b"mine"
+
+
+def test_a_film_is_replaced_where_that_is_asked_for_but_not_the_stack_itself(stack, tmp_path, capsys):
+    there = tmp_path / "there.mkv"
+    assert main(["film", str(stack[0]), "-o", str(there)]) == 0
+    before = there.read_bytes()
+    assert main(["film", str(there), "-o", str(there), "--overwrite"]) == 2
+    assert "there.mkv is what the result is made from, and would be lost" in capsys.readouterr().err
+    assert there.read_bytes() == before
+    there.write_bytes(b"old")
+    assert main(["film", str(stack[0]), "-o", str(there), "--overwrite"]) == 0
+    assert len(open_recording(there)) == 5

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from napari_fiberburst.errors import OutputError
+from napari_fiberburst.cli.work import add_overwrite, keep_input
 from napari_fiberburst.io import open_recording
 
 
@@ -19,6 +19,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument("input", type=Path, help="a TIFF stack, OME-Zarr, video or folder of frames")
     parser.add_argument("-o", "--output", type=Path, required=True, help="OUT.mp4, OUT.mkv or OUT.avi")
     parser.add_argument("--axes", help="order of the axes, such as CTYX, where the file does not say it")
+    add_overwrite(parser)
     parser.set_defaults(run=run)
 
 
@@ -26,9 +27,8 @@ def run(options: argparse.Namespace) -> int:
     """Write the film."""
     from napari_fiberburst.recordings.movie import check_movie, write_movie  # torch takes seconds to load
 
-    target = check_movie(options.output)
-    if target.exists():
-        raise OutputError(f"{target} is there already; choose another name, or remove it")
+    keep_input([options.input], options.output)
+    target = check_movie(options.output, may_replace=options.overwrite)
     write_movie(open_recording(options.input, axes=options.axes), target, scale_bar=True)
     print(f"wrote {target}")
     return 0

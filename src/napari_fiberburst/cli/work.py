@@ -2,8 +2,9 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 from napari_fiberburst.cli.progress import followed
@@ -33,6 +34,11 @@ def add_work(parser: argparse.ArgumentParser) -> None:
         help="go on with work that was begun with the same settings on the same recording (the default)",
     )
     begun.add_argument("--fresh", dest="resume", action="store_false", help="begin anew where work was begun")
+    add_overwrite(parser)
+
+
+def add_overwrite(parser: argparse.ArgumentParser) -> None:
+    """Add the option that lets an output be replaced."""
     parser.add_argument("--overwrite", action="store_true", help="replace an output that is finished")
 
 
@@ -44,12 +50,13 @@ def clear(options: argparse.Namespace) -> None:
     OutputError
         What would be replaced is the recording, or no picture of ours.
     """
+    from napari_fiberburst.recordings.movie import check_movie
     from napari_fiberburst.recordings.outputs import ENDING, outputs_of, work_of
     from napari_fiberburst.recordings.work import discard, is_begun, remove
 
     output, folder = options.output.resolve(), work_of(options.output.resolve())
-    if output in [path.resolve() for path in options.input]:
-        raise OutputError(f"{output} is what the result is made from, and would be lost; choose another name")
+    film = getattr(options, "mp4", None)
+    keep_input(options.input, output, *([] if film is None else [film]))
     if not options.resume:
         discard(folder)
     if options.overwrite and not is_begun(folder) and output.exists():
@@ -57,6 +64,21 @@ def clear(options: argparse.Namespace) -> None:
             raise OutputError(f"{output} is no OME-Zarr, and would be lost; choose another name, or remove it")
         for path in outputs_of(output):
             remove(path)
+    if options.overwrite and film is not None:
+        remove(check_movie(film, may_replace=True))
+
+
+def keep_input(inputs: Sequence[Path], *outputs: Path) -> None:
+    """Refuse to replace what a result is made from.
+
+    Raises
+    ------
+    OutputError
+        One of the outputs is an input.
+    """
+    for output in outputs:
+        if output.resolve() in [path.resolve() for path in inputs]:
+            raise OutputError(f"{output} is what the result is made from, and would be lost; choose another name")
 
 
 def worked(

@@ -211,6 +211,18 @@ def check_place(path: Path) -> None:
         raise OutputError(f"{path} cannot be written ({error}); choose another place") from error
 
 
+def check_free(path: Path) -> None:
+    """Refuse a path that is taken, because nothing is overwritten unasked.
+
+    Raises
+    ------
+    OutputError
+        There is something.
+    """
+    if path.exists():
+        raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
+
+
 def _is_among(target: Path, source: Path) -> bool:
     """Whether a file would lie in the folder, or match the pattern, that a burst is read from."""
     if source.is_dir():

@@ -1,6 +1,6 @@
 """A video file to look at, of any stack: 8 bits, at a contrast that shows it well."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io import open_recording
 from napari_fiberburst.io.picture import as_picture, limits_of
 from napari_fiberburst.io.pyav import import_av
-from napari_fiberburst.io.results import check_place
+from napari_fiberburst.io.results import check_free, check_place
 from napari_fiberburst.io.video_writer import VIDEO_ENDINGS, write_video
 
 # The contrast is told by so many frames, spread over the video.
@@ -23,19 +23,29 @@ _TOLD_BY = 24
 _BAR_WIDTH, _BAR_HEIGHT = 0.25, 0.015
 
 
-def check_movie(path: str | Path) -> Path:
+def check_movie(path: str | Path, *, may_replace: bool = False) -> Path:
     """Refuse a path that no video file can be written to, before long work rather than after it.
+
+    Parameters
+    ----------
+    path : str or Path
+        Where to write.
+    may_replace : bool
+        Whether a file that is there may be replaced.
 
     Raises
     ------
     OutputError
-        The ending is unknown, PyAV is missing, or the folder cannot be written.
+        The ending is unknown, PyAV is missing, the folder cannot be written, or the file is there and must not be
+        replaced.
     """
     target = Path(path)
     if target.suffix.lower() not in VIDEO_ENDINGS:
         raise OutputError(f"a video file ends in {', '.join(VIDEO_ENDINGS)}; got {target}")
     import_av(f"writing {target}", OutputError)
     check_place(target)
+    if not may_replace:
+        check_free(target)
     return target
 
 
@@ -46,8 +56,15 @@ def film_source(path: Path, acquisition: Acquisition) -> FrameSource:
     return replace(source, acquisition=replace(known, times=acquisition.times))
 
 
-def write_movie(source: FrameSource, target: Path, *, scale_bar: bool) -> Path:
-    """Write a stack as a video file.
+def write_movie(
+    source: FrameSource,
+    target: Path,
+    *,
+    scale_bar: bool,
+    limits: tuple[float, float] | None = None,
+    on_frame: Callable[[], object] = lambda: None,
+) -> Path:
+    """Write a stack as a video file; one that is there is replaced.
 
     Parameters
     ----------
@@ -57,6 +74,10 @@ def write_movie(source: FrameSource, target: Path, *, scale_bar: bool) -> Path:
         Ending in one of `VIDEO_ENDINGS`.
     scale_bar : bool
         Whether to draw one, where the size of a pixel is known.
+    limits : (float, float), optional
+        What is shown black and white, as recorded; by default as some frames of the stack tell.
+    on_frame : callable, optional
+        Called after each frame; what it raises ends the writing, and no file is left.
 
     Raises
     ------
@@ -66,8 +87,9 @@ def write_movie(source: FrameSource, target: Path, *, scale_bar: bool) -> Path:
     count, height, width, channels = source.shape
     if count < 2:
         raise OutputError(f"{source.name} has one frame; a film needs a time axis of two or more")
-    some = np.unique(np.linspace(0, count - 1, _TOLD_BY).astype(int)).tolist()
-    limits = limits_of(source.recorded(some).astype(np.float32))
+    if limits is None:
+        some = np.unique(np.linspace(0, count - 1, _TOLD_BY).astype(int)).tolist()
+        limits = limits_of(source.recorded(some).astype(np.float32))
     size = source.acquisition.pixel_size
     known = replace(
         Acquisition.from_dict(source.acquisition.to_dict()),
@@ -79,7 +101,8 @@ def write_movie(source: FrameSource, target: Path, *, scale_bar: bool) -> Path:
         channel_names=(),
     )
     bar = _bar_of(size[1], width) if scale_bar and size is not None else 0
-    return write_video(replace(source, acquisition=known, reader=_Frames(source, limits, bar)), target)
+    shown = replace(source, acquisition=known, reader=_Frames(source, limits, bar))
+    return write_video(shown, target, on_frame=on_frame)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import check_place, write_whole
+from napari_fiberburst.io.results import check_free, check_place, write_whole
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.work import is_begun
@@ -35,8 +35,8 @@ def check_target(output: str | Path, what: str) -> Path:
         raise OutputError(f"a {what} is written to a folder ending in {ENDING}; got {output}")
     poses = poses_of(target)
     for path in (target, poses):
-        if path.exists() and not is_begun(work_of(target)):
-            raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
+        if not is_begun(work_of(target)):
+            check_free(path)
     check_place(poses)
     return target
 

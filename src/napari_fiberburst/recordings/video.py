@@ -32,7 +32,7 @@ from napari_fiberburst.recordings.stretch import STRETCH, Plan, solve_unit
 from napari_fiberburst.recordings.tiles import picture_of
 from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.window import window_for
-from napari_fiberburst.recordings.work import Doing, claim, complete, finish, own, room
+from napari_fiberburst.recordings.work import Doing, claim, complete, finish, is_begun, own, room
 from napari_fiberburst.steps import drain
 
 # A stabilised video shows the whole picture where that has at most so many times the pixels of a frame.
@@ -131,7 +131,7 @@ def video(
     SettingsError
         The window is not a number of frames, or the regions do not fit.
     OutputError
-        The output exists, or other work was begun in its place.
+        The output or the video file exists, or other work was begun in its place.
     """
     return drain(
         videoing(
@@ -165,7 +165,7 @@ def videoing(
     """Make a video as `video` does; yields how far that is."""
     target = check_target(output, "video")
     if mp4 is not None:
-        check_movie(mp4)
+        check_movie(mp4, may_replace=is_begun(work_of(target)))
     if window is not None and (not isinstance(window, int) or window < 1):
         raise SettingsError(f"window must be a number of frames, at least 1; got {window!r}")
     if regions is not None and not stabilised:
@@ -184,7 +184,7 @@ def videoing(
         ),
     )
     with room(folder):
-        own(folder, [target, poses_of(target), *traces_of(target)])
+        own(folder, [target, poses_of(target), *traces_of(target), *([] if mp4 is None else [Path(mp4).resolve()])])
         located = yield from locating(source, folder, bundle=bundle, dof=dof, client=client)
         plan = _planned(located, target, window, stabilised, regions)
         yield from _solve(plan, located, target, client)

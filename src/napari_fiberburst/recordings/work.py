@@ -23,7 +23,7 @@ import torch
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import ClusterError, FiberBurstError, FullDiskError, OutputError
-from napari_fiberburst.io.results import write_whole
+from napari_fiberburst.io.results import check_free, write_whole
 
 # In the folder of work: what it is, and what it has begun to write outside.
 _IDENTITY, _OUTPUTS = "work.json", "outputs.json"
@@ -302,8 +302,8 @@ def own(folder: Path, paths: Sequence[Path]) -> None:
     """
     known = _owned(folder)
     for path in paths:
-        if path not in known and path.exists():
-            raise OutputError(f"{path} is there already; choose another name, remove it, or replace it by --overwrite")
+        if path not in known:
+            check_free(path)
     _write_json(folder / _OUTPUTS, [str(path) for path in dict.fromkeys([*known, *paths])])
 
 
