@@ -70,7 +70,11 @@ class PyramidLayer:
     def refresh(self) -> None:
         """Show what has been written since."""
         self._fit_contrast()
-        self.layer.refresh()
+        if self.layer.multiscale:
+            # napari keeps the coarsest level, which thumbnails are made of, until it is given data anew.
+            self.layer.data = list(self.layer.data)
+        else:
+            self.layer.refresh()
 
     def _fit_contrast(self) -> None:
         """Let the contrast follow what is there, until the user takes it in hand."""
