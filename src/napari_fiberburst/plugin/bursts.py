@@ -283,8 +283,8 @@ def _pixel_size(layer: Image, axes: str) -> tuple[tuple[float, float] | None, st
     units = {str(layer.units[axis]) for axis in at}
     if len(units) != 1 or units & set(_PIXEL_UNITS):
         return None, None
-    short = f"{layer.units[at[0]]:~}"
-    return (float(abs(layer.scale[at[0]])), float(abs(layer.scale[at[1]]))), short
+    height, width = np.linalg.norm(layer.affine.linear_matrix * layer.scale, axis=0)[at].tolist()
+    return (height, width), f"{layer.units[at[0]]:~}"
 
 
 def _truth(metadata: dict[str, Any], data: Any, axes: str) -> Truth | None:

@@ -18,9 +18,10 @@ from qtpy.QtCore import QEvent, QObject
 from qtpy.QtGui import QHelpEvent
 from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 
+from napari_fiberburst.plugin.bursts import guess_axes
 from napari_fiberburst.plugin.contributions import PLUGIN
+from napari_fiberburst.plugin.film import ask_and_save
 from napari_fiberburst.plugin.tasks.long import LongTask
-from napari_fiberburst.plugin.tasks.video import VideoTask
 
 if TYPE_CHECKING:
     import napari
@@ -72,11 +73,6 @@ COMMANDS = {
     "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
     "figure": Command(
         title="Save a figure", key=None, widget=lambda dock: dock.picture.display.card.report.figure_button
-    ),
-    "movie": Command(
-        title="Save the video as MP4",
-        key=None,
-        widget=lambda dock: next(task for task in dock.tasks if isinstance(task, VideoTask)).movie_button,
     ),
     "next_run": Command(
         title="Next run",
@@ -159,8 +155,19 @@ def press(name: str) -> None:
 
 start, pause, stop = partial(press, "start"), partial(press, "pause"), partial(press, "stop")
 compare, save = partial(press, "compare"), partial(press, "save")
-report, figure, movie = partial(press, "report"), partial(press, "figure"), partial(press, "movie")
+report, figure = partial(press, "report"), partial(press, "figure")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
+
+
+def save_film() -> None:
+    """Save the layer that is selected as a film, or say why that cannot be; the dock need not be open."""
+    import napari
+
+    viewer = napari.current_viewer()
+    if viewer is None:
+        return
+    dock = find_dock(viewer)
+    ask_and_save(list(viewer.layers.selection), guess_axes if dock is None else dock.input.axes_of, dock)
 
 
 def bind_keys() -> None:

@@ -195,13 +195,20 @@ class InputBox(QWidget):
                 "there is no burst: open one as an image layer with time, height and width, or take File > Open "
                 "Sample > Fiberburst"
             )
-        # S, samples, is another word for channels.
-        axes = self.axes.text().strip().upper().replace("S", "C")
+        axes = self._axes_given()
         if layers[0].rgb and not axes.endswith("C"):
             raise BurstError(f"the last axis of an RGB layer is its colours; got axes {axes}; let them end in C")
         whole = source_of(layers, axes)
         _ = whole.shape  # refuses axes that do not fit
         return whole
+
+    def axes_of(self, layer: Image) -> str:
+        """Return a letter for each axis of a layer: as given where the burst is in it, or else guessed."""
+        return self._axes_given() if layer in self.layers and not layer.rgb else guess_axes(layer)
+
+    def _axes_given(self) -> str:
+        # S, samples, is another word for channels.
+        return self.axes.text().strip().upper().replace("S", "C")
 
     def _place_of_frames(self, shape: tuple[int, int]) -> dict[str, Any]:
         """Return where the burst's frames lie in the viewer; nothing where they have another size."""

@@ -4,9 +4,11 @@ from collections.abc import Collection
 from itertools import count
 from pathlib import Path
 
+from napari.layers import Layer
 from qtpy.QtCore import Signal
 from qtpy.QtWidgets import QFileDialog, QLineEdit, QPushButton, QWidget
 
+from napari_fiberburst.plugin import METADATA_KEY
 from napari_fiberburst.plugin.sections import row_of
 
 ENDING = ".ome.zarr"
@@ -90,3 +92,17 @@ def stem_of(path: Path) -> Path:
     """Return a file's path without its ending, or both of its endings where the second is .ome."""
     stem = path.with_suffix("") if path.suffix else path
     return stem.with_suffix("") if stem.suffix == ".ome" else stem
+
+
+def opened_from(layer: Layer) -> list[Path]:
+    """Return the full paths of what a layer was opened from; none where it was made here."""
+    found = layer.metadata.get(METADATA_KEY, {}).get("recording_path") or layer.source.path or []
+    return [Path(path).absolute() for path in ([found] if isinstance(found, str | Path) else found)]
+
+
+def near(layer: Layer) -> Path:
+    """Return the path beside which what comes of a layer is written, without an ending."""
+    paths = opened_from(layer)
+    if paths:
+        return stem_of(paths[0])
+    return Path.home() / "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in layer.name)

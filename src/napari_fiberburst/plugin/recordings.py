@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io import open_recording
@@ -42,14 +43,12 @@ def recording_layer(
     is_colour = source.shape[3] == 3 and known.dtype == np.uint8
     frames = Frames(source, is_colour=is_colour)
     axes = frames.axes.removesuffix("C").lower()
-    times = () if known.times is None else known.times.tolist()
-    told = {"channel_names": known.channel_names, "times": times}
     look: dict[str, Any] = {
         "name": name,
         "rgb": is_colour,
         "multiscale": False,
         "axis_labels": tuple(axes),
-        "metadata": {METADATA_KEY: {RECORDING_KEY: told, "recording_path": path}},
+        "metadata": {METADATA_KEY: {RECORDING_KEY: recording_told(known), "recording_path": path}},
     }
     if not is_colour:
         look["contrast_limits"] = _limits(source)
@@ -60,8 +59,20 @@ def recording_layer(
     return frames, look, "image"
 
 
-def recording_in(burst: "BurstSource") -> FrameSource:
+def recording_told(known: Acquisition) -> dict[str, Any]:
+    """Return what layers of a recording, and of what is made of it, keep in their metadata of it."""
+    return {"channel_names": known.channel_names, "times": () if known.times is None else known.times.tolist()}
+
+
+def recording_in(burst: "BurstSource", *, levels: tuple[float, float] | None = None) -> FrameSource:
     """Return all frames of the layers of a burst as a recording.
+
+    Parameters
+    ----------
+    burst : BurstSource
+        The layers.
+    levels : (float, float), optional
+        Intensities of black and white, where the frames do not tell them; by default they are looked for.
 
     Raises
     ------
@@ -74,12 +85,16 @@ def recording_in(burst: "BurstSource") -> FrameSource:
         source = replace(first.source, reader=deepcopy(first.source.reader))
     else:
         _ = burst.shape  # refuses axes that do not fit
-        source = open_recording(burst.whole, axes="TYXC"[: burst.whole.ndim])
+        # What lies in one layer is not copied, nor read, into another order.
+        whole, order = (burst.whole, None) if further else (first, axes)
+        black, white = levels or (None, None)
+        source = open_recording(whole, axes=order, black_level=black, white_level=white)
     known = replace(
         source.acquisition,
         pixel_size=burst.pixel_size or source.acquisition.pixel_size,
         unit=burst.unit or source.acquisition.unit,
         channel_names=burst.channel_names or source.acquisition.channel_names,
+        times=source.acquisition.times if burst.times is None else np.array(burst.times),
     )
     return replace(source, acquisition=known, name=burst.name)
 

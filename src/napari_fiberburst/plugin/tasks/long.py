@@ -15,13 +15,13 @@ from superqt.utils import create_worker
 
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import BurstError, FiberBurstError
-from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 from napari_fiberburst.plugin.bundles import BundleSource
 from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.long_job import LongJob, in_words
-from napari_fiberburst.plugin.output_row import OutputRow, stem_of, work_of
+from napari_fiberburst.plugin.output_row import OutputRow, near, stem_of, work_of
 from napari_fiberburst.plugin.placement import Placement
-from napari_fiberburst.plugin.recordings import recording_in, reopened
+from napari_fiberburst.plugin.recordings import recording_in, recording_told, reopened
 from napari_fiberburst.plugin.sections import form_layout, row_of
 from napari_fiberburst.plugin.tasks.task import Task
 
@@ -179,12 +179,12 @@ class LongTask(Task):
         """
         if self.input.region.value is not None:
             raise BurstError(f"a {self.kind} is made of whole frames; choose no region")
-        near = self._near()
+        beside = near(self.input.layers[0]) if self.input.layers else path
         if path in _WRITTEN:
-            self.output.suggest_free(near, but_not=_WRITTEN)
+            self.output.suggest_free(beside, but_not=_WRITTEN)
             raise BurstError(f"{path} is being written just now; another name is suggested, or wait for its end")
         if path.exists() and not work_of(path).exists():
-            self.output.suggest_free(near, but_not=_WRITTEN)
+            self.output.suggest_free(beside, but_not=_WRITTEN)
             raise BurstError(f"{path} is there already; another name is suggested, or choose one")
 
     def _end(self, job: LongJob) -> None:
@@ -239,7 +239,8 @@ class LongTask(Task):
                 known.refresh()
             return
         name = f"{stem_of(path.parent if what else path).name}{f': {what}' if what else ''}"
-        made = PyramidLayer(path, name, placement, source.acquisition, {METADATA_KEY: {"run": name}})
+        told = {"run": name, "recording_path": str(path), RECORDING_KEY: recording_told(source.acquisition)}
+        made = PyramidLayer(path, name, placement, source.acquisition, {METADATA_KEY: told})
         self._shown[path] = made
         chosen = set(self._viewer.layers.selection)
         self._viewer.add_layer(made.layer)
@@ -268,20 +269,12 @@ class LongTask(Task):
         self.status.setText(problem)
         show_error(problem)
 
-    def _near(self) -> Path:
-        """Return the path beside which results are written, without an ending."""
-        layer = self.input.burst.value
-        opened_from = layer.metadata.get(METADATA_KEY, {}).get("recording_path") or layer.source.path
-        if opened_from is not None:
-            return stem_of(Path(opened_from if isinstance(opened_from, str | Path) else opened_from[0]).absolute())
-        return Path.home() / "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in layer.name)
-
     def _take_input(self) -> None:
         """Suggest where to write, and say what can be done with what is chosen now."""
         if self.job is not None:
             return
         if self.input.burst.value is not None:
-            self.output.suggest(self._near())
+            self.output.suggest(near(self.input.burst.value))
         self._tell_what_is_there()
         self._follow_state("ready")
 

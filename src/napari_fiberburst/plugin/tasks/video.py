@@ -4,15 +4,12 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from napari.utils.notifications import show_error, show_info
-from qtpy.QtWidgets import QCheckBox, QFileDialog, QPushButton, QSpinBox, QWidget
-from superqt.utils import create_worker
+from qtpy.QtWidgets import QCheckBox, QPushButton, QSpinBox, QWidget
 
-from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.data.source import FrameSource
+from napari_fiberburst.plugin.bursts import guess_axes
+from napari_fiberburst.plugin.film import ask_and_save
 from napari_fiberburst.plugin.input_box import InputBox
-from napari_fiberburst.plugin.output_row import stem_of
-from napari_fiberburst.plugin.problems import why
 from napari_fiberburst.plugin.tasks.long import LongTask
 
 if TYPE_CHECKING:
@@ -34,8 +31,8 @@ class VideoTask(LongTask):
         How many frames stand behind each; 0 as the motion asks for.
     stabilised : QCheckBox
         Whether the scene stands still.
-    movie_button : QPushButton
-        Saves the video as a film.
+    film_button : QPushButton
+        Saves the video as a film, as it is shown.
     """
 
     title: ClassVar[str] = "Video"
@@ -44,8 +41,7 @@ class VideoTask(LongTask):
 
     def __init__(self, viewer: "napari.viewer.Viewer", source: InputBox, parent: QWidget | None = None) -> None:
         super().__init__(viewer, source, parent)
-        self._made: tuple[Path, Acquisition] | None = None
-        self.movie_button.clicked.connect(self._ask_and_save)
+        self.film_button.clicked.connect(self._ask_and_save)
 
     def begin(
         self, source: FrameSource, output: Path, bundle: Any, settings: dict[str, Any]
@@ -75,8 +71,6 @@ class VideoTask(LongTask):
 
     def paths_of(self, result: "Video") -> tuple[Path, ...]:
         """Return the video."""
-        if self.told_of is not None:
-            self._made = (result.path, self.told_of[0].acquisition)
         return (result.path,)
 
     def lines_of(self, result: "Video") -> list[str]:
@@ -89,40 +83,13 @@ class VideoTask(LongTask):
 
     def card_widgets(self) -> tuple[QWidget, ...]:
         """Return what can be done with the video."""
-        self.movie_button = QPushButton("Save as MP4…")
-        self.movie_button.setToolTip("Save the video as a film, with a scale bar where the size of a pixel is known.")
-        return (self.movie_button,)
-
-    def save_movie(self, path: str | Path) -> None:
-        """Save the video as a film, in another thread, or say why not."""
-        if self._made is None:
-            return
-        self.movie_button.setEnabled(False)
-        create_worker(
-            _written,
-            *self._made,
-            Path(path),
-            _connect={"returned": self._take_movie, "errored": self._take_error},
-            _ignore_errors=True,
+        self.film_button = QPushButton("Save film…")
+        self.film_button.setToolTip(
+            "Save the video as a film, at the contrast of its layer, with a scale bar where the size of a pixel is "
+            "known. Of any other layer with time: Save film… in the command palette."
         )
-
-    def _take_movie(self, path: Path) -> None:
-        self.movie_button.setEnabled(True)
-        show_info(f"wrote {path}")
-
-    def _take_error(self, error: Exception) -> None:
-        self.movie_button.setEnabled(True)
-        show_error(why(error, "a film could not be saved"))
+        return (self.film_button,)
 
     def _ask_and_save(self) -> None:
-        if self._made is not None:
-            suggested = str(stem_of(self._made[0].with_suffix(""))) + ".mp4"
-            path, _ = QFileDialog.getSaveFileName(self, "Save as MP4", suggested, "Films (*.mp4 *.avi *.mkv)")
-            if path:
-                self.save_movie(path)
-
-
-def _written(video: Path, acquisition: Acquisition, target: Path) -> Path:
-    from napari_fiberburst.recordings.movie import check_movie, film_source, write_movie
-
-    return write_movie(film_source(video, acquisition), check_movie(target), scale_bar=True)
+        for path in self._done:
+            ask_and_save([self._shown[path].layer], guess_axes, self)
