@@ -145,7 +145,10 @@ def test_settings_are_checked_before_anything_is_opened(tmp_path):
     for text, said in (
         ("window = 0", "window must be a number of frames, at least 1; got 0"),
         ("stabilised = 1", "stabilised must be true or false; got 1"),
-        ("regions = 'x.tif'", "regions is no setting of a video; known ones are bundle, motion, window"),
+        ("regions = 'x.tif'", r"regions must be a label image, or a folder of one for each recording; got .*x\.tif"),
+        ("scale_bar = 2", "scale_bar must be true or false; got 2"),
+        ("scale_bar = true", "scale_bar is drawn into a film, and none is asked for"),
+        ("speed = 1", "speed is no setting of a video; known ones are bundle, motion, window, stabilised, regions"),
     ):
         file.write_text(f"[video]\n{text}")
         with pytest.raises(SettingsError, match=said):
@@ -155,6 +158,35 @@ def test_settings_are_checked_before_anything_is_opened(tmp_path):
         read_settings(file, "burst")
     file.write_text("[mosaic]\nbundle = 'probe.bundle'")
     assert read_settings(file, "mosaic")["mosaic"]["bundle"] == str(tmp_path / "probe.bundle")
+    given = {"motion": "translation", "bundle": "/probe"}
+    assert read_settings(file, "mosaic", given)["mosaic"] == given
+
+
+def test_videos_of_a_batch_have_what_the_command_line_asks_for(folder, tmp_path, capsys):
+    for name in ("broken.avi", "clip 10.mkv"):
+        (folder / name).unlink()
+    frames = tifffile.imread(folder / "clip 9.tif")[:12]
+    tifffile.imwrite(folder / "clip 11.tif", frames, photometric="minisblack")
+    (folder / "clip 9.tif").rename(tmp_path / "whole.tif")
+    sized = {"axes": "TYX", "PhysicalSizeX": 0.5, "PhysicalSizeY": 0.5}
+    tifffile.imwrite(folder / "clip 9.ome.tif", frames, photometric="minisblack", metadata=sized)
+    regions = tmp_path / "regions"
+    regions.mkdir()
+    tifffile.imwrite(regions / "clip 11.tif", np.pad(np.full((20, 30), 7, np.uint8), ((30, 47), (40, 51))))
+    (tmp_path / "batch.toml").write_text("[video]\nwindow = 9\nmotion = 'translation'\n")
+    words = ["batch", str(folder), "--task", "video", "-o", str(tmp_path / "out")]
+    given = ["--settings", str(tmp_path / "batch.toml"), "--window", "5", "--mp4", "--scale-bar"]
+    assert main([*words, *given, "--regions", str(regions)]) == 0
+    without, with_regions = table_of(tmp_path / "out")
+    assert all("5 frames stand behind each" in row["facts"] for row in (without, with_regions))
+    assert "clip 11.tif/video.traces.csv" in with_regions["outputs"]
+    assert (tmp_path / "out" / "clip 11.tif" / "video.traces.csv").read_text().startswith("frame,seconds,region_7")
+    assert "without regions, because there is no" in without["notes"]
+    film = open_recording(tmp_path / "out" / "clip 9.ome.tif" / "video.mp4").recorded([7])[0, ..., 0]
+    # The bar: of 30.25 pixels at most, 10 micrometres are 20.
+    assert (film[80:, 70:] > 235).sum(axis=1).max() >= 20
+    assert main([*words[:3], "mosaic", "-o", str(tmp_path / "m"), "--window", "5"]) == 2
+    assert "window is no setting of a mosaic" in capsys.readouterr().err
 
 
 def test_another_batch_and_other_files_are_left_alone(folder, tmp_path, capsys):

@@ -5,13 +5,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from napari_fiberburst.cli.mosaic import add_known
 from napari_fiberburst.cli.progress import followed
+from napari_fiberburst.cli.video import add_frames_shown
 from napari_fiberburst.cli.work import add_workers, goes_on
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.report.batch import write_batch
 from napari_fiberburst.results.batch import Row, write_table
 
 TASKS = ("mosaic", "video", "burst")
+# Settings of a task that have an option of their own.
+_SETTINGS = ("bundle", "motion", "window", "stabilised", "regions", "mp4", "scale_bar")
 
 
 def add_to(commands: Any) -> None:
@@ -28,8 +32,11 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--settings", type=Path, metavar="FILE.toml", help="with a table of settings for each task, such as [mosaic]"
     )
+    parser.add_argument("--mp4", action="store_true", help="write a film beside each video")
+    add_known(parser)
+    add_frames_shown(parser)
     add_workers(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, motion=None)  # what is not given is as the settings file has it
 
 
 def run(options: argparse.Namespace) -> int:
@@ -38,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     from napari_fiberburst.recordings.batch import batching, read_settings, recordings_in
     from napari_fiberburst.recordings.cluster import workers
 
-    settings = read_settings(options.settings, options.task)
+    settings = read_settings(options.settings, options.task, _given(options))
     folder, output = options.folder.resolve(), options.output.resolve()
     recordings_in(folder, output)
     _make(output)
@@ -54,6 +61,16 @@ def run(options: argparse.Namespace) -> int:
         print(f"{row.name} failed: {'; '.join(row.notes)}")
     print(f"{len(rows) - len(failed)} of {len(rows)} recordings are done; wrote {output / 'report.html'} and table.csv")
     return 1 if failed else 0
+
+
+def _given(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the settings that are given on the command line, which go before those of the settings file."""
+    given = {name: getattr(options, name) for name in _SETTINGS}
+    return {
+        name: str(value.resolve()) if isinstance(value, Path) else value
+        for name, value in given.items()
+        if value is not None and value is not False
+    }
 
 
 def _make(output: Path) -> None:

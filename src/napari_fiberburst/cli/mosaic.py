@@ -31,6 +31,12 @@ def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
         "input", type=Path, nargs="+", help="a video, TIFF, folder or OME-Zarr; several are one recording"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help=output)
+    add_known(parser)
+    add_work(parser)
+
+
+def add_known(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say what is known of bundle and motion."""
     parser.add_argument("--bundle", type=Path, help="probe.bundle, or an image of the bundle in even light")
     parser.add_argument(
         "--motion",
@@ -38,7 +44,6 @@ def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
         default="auto",
         help="how frames may lie: shifted, or turned and grown as well; default, as they ask for",
     )
-    add_work(parser)
 
 
 def opened(options: argparse.Namespace) -> tuple[FrameSource, "Bundle | None"]:

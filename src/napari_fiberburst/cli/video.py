@@ -4,13 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import tifffile
-from numpy.typing import NDArray
-
 from napari_fiberburst.cli.mosaic import add_recording, opened
 from napari_fiberburst.cli.work import clear, worked
-from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.settings.freedom import FREEDOM
 
 
@@ -26,6 +21,13 @@ def add_to(commands: Any) -> None:
         "OUT.ome.zarr; the places of all frames go into OUT.poses.csv beside it, and what each core has seen into "
         "OUT.traces.zarr",
     )
+    parser.add_argument("--mp4", type=Path, metavar="OUT.mp4", help="a video file to look at as well, in 8 bits")
+    add_frames_shown(parser)
+    parser.set_defaults(run=run)
+
+
+def add_frames_shown(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how frames are shown, and what is read from them."""
     parser.add_argument(
         "--window", type=int, metavar="FRAMES", help="how many frames stand behind each; default, as the motion asks"
     )
@@ -39,22 +41,21 @@ def add_to(commands: Any) -> None:
         help="a label image on the first frame, or on the stabilised picture: means over its regions go into "
         "OUT.traces.zarr and OUT.traces.csv",
     )
-    parser.add_argument("--mp4", type=Path, metavar="OUT.mp4", help="a video file to look at as well, in 8 bits")
     parser.add_argument(
-        "--scale-bar", action="store_true", help="draw one into that file, where the size of a pixel is known"
+        "--scale-bar", action="store_true", help="draw one into the film, where the size of a pixel is known"
     )
-    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Make the video and say what has come of it."""
     # torch takes seconds to load
     from napari_fiberburst.recordings.outputs import check_target
+    from napari_fiberburst.recordings.regions import read_regions
     from napari_fiberburst.recordings.video import videoing
 
     clear(options)
     check_target(options.output, "video")
-    regions = None if options.regions is None else _regions(options.regions)
+    regions = None if options.regions is None else read_regions(options.regions)
     source, bundle = opened(options)
     found = worked(
         options,
@@ -76,11 +77,3 @@ def run(options: argparse.Namespace) -> int:
     for note in found.notes:
         print(f"note: {note}")
     return 0
-
-
-def _regions(path: Path) -> NDArray[np.integer]:
-    try:
-        labels: NDArray[np.integer] = tifffile.imread(path)
-    except (OSError, tifffile.TiffFileError) as error:
-        raise SettingsError(f"{path} cannot be read as a label image ({error}); save one as TIFF") from error
-    return labels

@@ -32,19 +32,23 @@ _THUMBNAIL = 192
 # What one recording alone can fail by; others go on.
 _FAILURES = (ValueError, OSError, RuntimeError, LookupError, ArithmeticError, MemoryError)
 
+# Settings that name a file or a folder.
+_PATHS = ("bundle", "regions")
 _OPENING = ("axes", "black_level", "white_level")
 
 
-def read_settings(path: Path | None, task: str) -> dict[str, dict[str, Any]]:
+def read_settings(path: Path | None, task: str, given: Settings | None = None) -> dict[str, dict[str, Any]]:
     """Read a settings file.
 
     Parameters
     ----------
     path : Path or None
         A TOML file with a table for each task, such as ``[mosaic]``, and ``[recording]`` for how recordings are opened.
-        A ``bundle`` is a path, relative to the file.
+        ``bundle`` and ``regions`` are paths, relative to the file.
     task : str
         Whose table is checked.
+    given : mapping, optional
+        Settings of the task that go before those of the file.
 
     Returns
     -------
@@ -69,9 +73,11 @@ def read_settings(path: Path | None, task: str) -> dict[str, dict[str, Any]]:
     for name in opening:
         if name not in _OPENING:
             raise SettingsError(f"{name} is not of how recordings are opened; expected {', '.join(_OPENING)}")
+    for name in _PATHS:
+        if path is not None and isinstance(own.get(name), str):
+            own[name] = str((path.parent / own[name]).resolve())
+    own |= given or {}
     TASKS[task][1]({name: value for name, value in own.items() if name != "bundle"})
-    if path is not None and "bundle" in own:
-        own["bundle"] = str((path.parent / own["bundle"]).resolve())
     return {"recording": opening, task: own}
 
 

@@ -5,6 +5,7 @@ import io
 from pathlib import Path
 
 import numpy as np
+import tifffile
 import torch
 import zarr
 from numpy.typing import NDArray
@@ -14,6 +15,21 @@ from napari_fiberburst.io.results import write_whole
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.traces import PART, Traces
 from napari_fiberburst.recordings.track import Track
+
+
+def read_regions(path: Path) -> NDArray[np.integer]:
+    """Return the label image in a TIFF.
+
+    Raises
+    ------
+    SettingsError
+        It cannot be read.
+    """
+    try:
+        labels: NDArray[np.integer] = tifffile.imread(path)
+    except (OSError, tifffile.TiffFileError) as error:
+        raise SettingsError(f"{path} cannot be read as a label image ({error}); save one as TIFF") from error
+    return labels
 
 
 def check_regions(labels: NDArray[np.integer], shape: tuple[int, int], where: str) -> NDArray[np.int64]:

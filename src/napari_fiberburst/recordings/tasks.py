@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
-from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.errors import OutputError, SettingsError
+from napari_fiberburst.io.pyav import import_av
 from napari_fiberburst.pipeline.choose import best_burst
 from napari_fiberburst.pipeline.reconstruct import reconstruct
 from napari_fiberburst.recordings.mosaic import mosaicking
-from napari_fiberburst.recordings.movie import check_movie
+from napari_fiberburst.recordings.regions import read_regions
 from napari_fiberburst.recordings.video import videoing
 from napari_fiberburst.recordings.work import Doing
 from napari_fiberburst.settings import choose
@@ -61,7 +62,7 @@ def _mosaic(
 def _video(
     source: FrameSource, folder: Path, bundle: Bundle | None, settings: Settings, client: Any | None
 ) -> Generator[Doing, None, Made]:
-    has_film = settings.get("mp4", False)
+    labels, remarks = _regions(settings, folder.name)
     made = yield from videoing(
         source,
         folder / "video.ome.zarr",
@@ -69,20 +70,33 @@ def _video(
         dof=FREEDOM[settings.get("motion", "auto")],
         window=settings.get("window"),
         stabilised=settings.get("stabilised", False),
-        regions=None,
-        mp4=folder / "video.mp4" if has_film else None,
-        scale_bar=has_film and source.acquisition.pixel_size is not None,
+        regions=labels,
+        mp4=folder / "video.mp4" if settings.get("mp4", False) else None,
+        scale_bar=settings.get("scale_bar", False),
         client=client,
     )
     placed, count = int((made.track.piece >= 0).sum()), len(made.track)
     frames = zarr.open_array(made.path / "0", mode="r")
     return Made(
-        outputs=(made.path, made.poses, made.traces, *(() if made.movie is None else (made.movie,))),
+        outputs=tuple(
+            path for path in (made.path, made.poses, made.traces, made.table, made.movie) if path is not None
+        ),
         verdict=_verdict(placed / count, made.quality),
-        notes=made.notes,
+        notes=(*made.notes, *remarks),
         facts=(f"{placed} of {count} frames have a place", f"{made.window} frames stand behind each"),
         picture=_channels_last(np.asarray(frames[count // 2])),
     )
+
+
+def _regions(settings: Settings, recording: str) -> tuple[NDArray[np.integer] | None, tuple[str, ...]]:
+    """Return the regions of a recording, where it has any: one file for all, or one that is called as the recording."""
+    if "regions" not in settings:
+        return None, ()
+    path = Path(settings["regions"])
+    if not path.is_dir():
+        return read_regions(path), ()
+    own = path / f"{Path(recording).stem}.tif"
+    return (read_regions(own), ()) if own.exists() else (None, (f"without regions, because there is no {own}",))
 
 
 def _burst(
@@ -118,15 +132,20 @@ def _check_mosaic(settings: Settings) -> None:
 
 
 def _check_video(settings: Settings) -> None:
-    _check_names(settings, "video", ("motion", "window", "stabilised", "mp4"))
+    _check_names(settings, "video", ("motion", "window", "stabilised", "regions", "mp4", "scale_bar"))
     window = settings.get("window")
     if window is not None and (not isinstance(window, int) or isinstance(window, bool) or window < 1):
         raise SettingsError(f"window must be a number of frames, at least 1; got {window!r}")
-    for name in ("stabilised", "mp4"):
+    for name in ("stabilised", "mp4", "scale_bar"):
         if not isinstance(settings.get(name, False), bool):
             raise SettingsError(f"{name} must be true or false; got {settings[name]!r}")
     if settings.get("mp4", False):
-        check_movie("video.mp4")
+        import_av("writing films", OutputError)
+    elif settings.get("scale_bar", False):
+        raise SettingsError("scale_bar is drawn into a film, and none is asked for; set mp4 as well")
+    regions = settings.get("regions", ".")
+    if not isinstance(regions, str) or not Path(regions).exists():
+        raise SettingsError(f"regions must be a label image, or a folder of one for each recording; got {regions!r}")
 
 
 def _check_names(settings: Settings, task: str, known: tuple[str, ...]) -> None:
