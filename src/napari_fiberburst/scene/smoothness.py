@@ -1,11 +1,11 @@
 """How smooth the scene should be, chosen by what one part of the burst tells of another."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
@@ -13,23 +13,29 @@ from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.quality.resolution import RingCorrelation, RingSpectra, correlation_of, ring_spectra
+from napari_fiberburst.scene.power import fit_power
 from napari_fiberburst.scene.prediction import misfit
-from napari_fiberburst.scene.spline import assemble
+from napari_fiberburst.scene.rehearsal import Rehearsal
+from napari_fiberburst.scene.spline import NormalEquations, assemble
 from napari_fiberburst.scene.window import liveliest
 
 # Smoothness is looked for among these where neighbours tell, and between them.
 _STILL_CANDIDATES = tuple(10 ** (exponent / 2) for exponent in range(5, -4, -1))
 _STILL_ITERATIONS = 40
-# Where halves of the burst tell, it is looked for among these; the halves' own is so rough that even the finest detail
-# is in them.
-_CANDIDATES = np.geomspace(10, 3e-4, 120)
+# That of the halves of a burst.
 _ROUGH = 0.003
 # The smoothness where it cannot be told.
 UNTOLD = 0.1
 # Smoothness is chosen in a window of at most this many nodes a side.
 _WINDOW = 224
-# Of waves that pass by less, nothing is known.
-_LEAST_TRANSFER = 1e-6
+# Where halves of the burst tell, it is looked for in steps of this factor from UNTOLD, at first that many, and between
+# these.
+_STEP, _FIRST_STEP, _STEPS = 3.0, -2, (-6, 4)
+_REHEARSED_ITERATIONS = 16
+# Halves are rehearsed once more where the first time takes more than this part from the noise: much of it was gaps.
+_REHEARSALS, _SETTLED = 2, 0.75
+# More tell no more, because what these pass is measured.
+_ROUGH_ITERATIONS = 25
 # Every core is left out once, with so many others that most of its neighbours stay.
 _FOLDS = 6
 
@@ -50,15 +56,35 @@ class Smoothness:
     agreement: RingCorrelation | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Passing:
+    """What two solutions, each from one half of the burst, pass at the frequencies of their spectra.
+
+    Attributes
+    ----------
+    scene : numpy.ndarray
+        (F,) part of the scene's power that both show.
+    gaps : numpy.ndarray
+        (F,) power of what the scene itself makes them differ by, because they look at other places.
+    noise : numpy.ndarray
+        (F,) power that samples of variance 1 give to one.
+    """
+
+    scene: NDArray[np.float64]
+    gaps: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
 def choose_smoothness(
     samples: Samples, points: Tensor, frames: NDArray[np.intp], grid: Grid, scene: Tensor
 ) -> Smoothness:
     """Choose the smoothness at which the scene's error is least, by how halves of the burst agree at each frequency.
 
     Even and odd frames are solved apart and hardly smoothed. What their spectra have in common is the scene, what they
-    have not is noise, both as these solutions pass them; so it is known what error any other would have: see
-    `_expected_error`. Samples left out cannot tell: a footprint hides from them just the detail, and the noise, that
-    matter.
+    have not is noise, both as these solutions pass them. How they do is at first taken to be as of even sampling, and
+    then measured: a scene of the spectrum found is seen at the same places, and solved. So is the error of the whole
+    at one smoothness after the other; see `napari_fiberburst.scene.rehearsal`. Samples left out cannot tell: a
+    footprint hides from them just the detail, and the noise, that matter.
 
     Parameters
     ----------
@@ -72,63 +98,123 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = liveliest(grid, scene, _WINDOW)
-    in_grey = replace(samples, values=samples.grey[..., None])
-    halves = [assemble(window, in_grey, points, among_frames(half, samples)) for half in (frames[::2], frames[1::2])]
-    densities = [blur(half.density(), 3.0) for half in halves]
+    halves = [among_frames(half, samples) for half in (frames[::2], frames[1::2])]
+
+    def equations_of(some: Samples) -> list[NormalEquations]:
+        return [assemble(window, some, points, half) for half in halves]
+
+    # Conjugate gradients would take what is left of the mean light for a part of the detail.
+    solved = equations_of(_without_mean(samples))
+    densities = [blur(half.density(), 3.0) for half in solved]
     both = torch.minimum(*densities)
     sampled = (both > 0.2 * both.max()) & (both > 0)
     if not bool(sampled.any()):
         return Smoothness(UNTOLD, None)
-    first, second = (half.image(half.solve(_ROUGH), _ROUGH)[0].cpu().numpy() for half in halves)
     soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
-    spectra = ring_spectra(first, second, soft)
-    density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in halves]))
-    errors = _expected_error(spectra, *halves[0].responses(spectra.frequency), density, _ROUGH)
-    weight = float(_CANDIDATES[np.argmin(errors)]) if np.isfinite(errors).all() else UNTOLD
-    return Smoothness(weight, correlation_of(spectra).in_pixels(window.spacing))
+    images = [_hardly_smoothed(half) for half in solved]
+    spectra = _mean_spectra(images[0], images[1], soft)
+    passed, prior = solved[0].responses(spectra.frequency)
+    density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in solved]))
+
+    power, variance = _told(spectra, _as_if_even(passed, prior, density), passed)
+    for _ in range(_REHEARSALS):
+        rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
+        passing = _measured(
+            rehearsal, [_hardly_smoothed(half) for half in equations_of(rehearsal.scene_and_noise)], soft
+        )
+        before = variance
+        power, variance = _told(spectra, passing, passed)
+        if variance > _SETTLED * before:
+            break
+    rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
+    equations = assemble(window, rehearsal.samples, points, among_frames(frames, samples))
+    in_grey = ring_spectra(images[0].mean(axis=0), images[1].mean(axis=0), soft)
+    return Smoothness(_least_error(rehearsal, equations, variance), correlation_of(in_grey).in_pixels(window.spacing))
 
 
-def _expected_error(
-    spectra: RingSpectra,
-    passed: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    density: float,
-    rough: float,
-) -> NDArray[np.float64]:
-    """Return the error that a scene from both halves is expected to have at each candidate.
+def _without_mean(samples: Samples) -> Samples:
+    mean = [steady.weighted_mean(channel, samples.weights) for channel in samples.values.unbind(dim=-1)]
+    return replace(samples, values=samples.values - torch.stack(mean))
+
+
+def _hardly_smoothed(half: NormalEquations) -> NDArray[np.float32]:
+    """Return the image (C, H, W) that a half shows; it is so rough that even the finest detail is in it."""
+    image: NDArray[np.float32] = half.image(half.solve(_ROUGH, iterations=_ROUGH_ITERATIONS), _ROUGH).cpu().numpy()
+    return image
+
+
+def _mean_spectra(first: NDArray[np.float32], second: NDArray[np.float32], soft: NDArray[np.float32]) -> RingSpectra:
+    """Return the spectra of two images (C, H, W), the mean over their channels: each has noise of its own."""
+    parts = [ring_spectra(one, other, soft) for one, other in zip(first, second, strict=True)]
+    powers = np.mean([part.powers for part in parts], axis=0)
+    return replace(parts[0], cross=np.mean([part.cross for part in parts], axis=0), powers=(powers[0], powers[1]))
+
+
+def _as_if_even(passed: NDArray[np.float64], prior: NDArray[np.float64], density: float) -> _Passing:
+    """Return what halves would pass, were sampling even.
 
     With the density c of samples, the footprint's response B and the prior's P, a solution passes the part
     c B^2 / (c B^2 + lambda P) of a wave, and the noise sigma^2 c B^2 / (c B^2 + lambda P)^2 of samples (Wahba, "Spline
-    models for observational data", 1990, chapter 4). That is undone for the halves, and done for all samples, at twice
-    the density. A scene's spectrum falls off, which says what it is where the footprint lets nothing through; the noise
-    of samples is white, so its variance is the median over the waves that pass, because what is wrong with gains and
-    motion shows in the longest ones.
-
-    Parameters
-    ----------
-    spectra : RingSpectra
-        Of the halves.
-    passed, prior : numpy.ndarray
-        (F,) B^2 and P at its frequencies.
-    density : float
-        Of a half, samples to a node.
-    rough : float
-        lambda of the halves.
+    models for observational data", 1990, chapter 4).
     """
-    # The lowest ring is what leaks from the mean and the window's edge.
-    count, passed, prior = spectra.count[1:], passed[1:], prior[1:]
-    common, noise = spectra.cross[1:], spectra.noise[1:]
-    stiff = density * passed + rough * prior
-    transfer = np.maximum(density * passed / stiff, _LEAST_TRANSFER)
-    trust = count * transfer**4 / (np.abs(common) + noise + np.finfo(float).tiny) ** 2
-    falling = isotonic_regression(common / transfer**2, weights=trust / trust.max(), increasing=False)
-    power = np.maximum(falling.x, 0)
-    of_samples = noise * stiff**2 / (density * np.maximum(passed, _LEAST_TRANSFER))
-    variance = weighted_median(of_samples, count * passed)
-    weight = _CANDIDATES[:, None] * prior
-    all_stiff = 2 * density * passed + weight
-    errors = (weight / all_stiff) ** 2 * power + 2 * density * passed * variance / all_stiff**2
-    return np.asarray(errors @ count)
+    stiff = density * passed + _ROUGH * prior
+    noise = density * passed / stiff**2
+    return _Passing(scene=(density * passed / stiff) ** 2, gaps=np.zeros_like(noise), noise=noise)
+
+
+def _measured(rehearsal: Rehearsal, images: list[NDArray[np.float32]], soft: NDArray[np.float32]) -> _Passing:
+    """Return what halves pass of a scene that is known, and of noise."""
+    nodes = rehearsal.nodes.cpu().numpy()
+    there = ring_spectra(nodes, nodes, soft).cross
+    shown = [np.maximum(ring_spectra(image[0], nodes, soft).cross / there, 0) for image in images]
+    return _Passing(
+        scene=shown[0] * shown[1],
+        gaps=ring_spectra(images[0][0], images[1][0], soft).noise,
+        noise=ring_spectra(images[0][1], images[1][1], soft).noise,
+    )
+
+
+def _told(spectra: RingSpectra, passing: _Passing, passed: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the power of the scene (F - 1,) and the variance of samples of weight 1, from the spectra of halves (F,).
+
+    The lowest ring is what leaks from the mean and the window's edge. The noise of samples is white, so its variance is
+    the median over the waves that pass, `passed` by the footprint, because what is wrong with gains and motion shows in
+    the longest ones.
+    """
+    count, scene, noise = spectra.count[1:], passing.scene[1:], passing.noise[1:]
+    power = fit_power(spectra.frequency[1:], spectra.cross[1:], spectra.noise[1:], count, scene)
+    own = np.maximum(spectra.noise[1:] - passing.gaps[1:], 0)
+    return power, weighted_median(own / np.maximum(noise, np.finfo(float).tiny), count * passed[1:] * scene)
+
+
+def _least_error(rehearsal: Rehearsal, equations: NormalEquations, variance: float) -> float:
+    """Return the smoothness at which a scene that is known is solved best from all samples, with noise of `variance`.
+
+    It is walked to in even steps of its logarithm, and found between them by a parabola.
+    """
+    errors: dict[int, float] = {}
+    scene, before = None, UNTOLD
+
+    def error(step: int) -> float:
+        nonlocal scene, before
+        if step not in errors:
+            weight = UNTOLD * _STEP**step
+            start = None if scene is None else equations.carried(scene, before, weight)
+            scene, before = equations.solve(weight, start, _REHEARSED_ITERATIONS), weight
+            missed, of_noise = rehearsal.errors(equations, scene, weight)
+            errors[step] = missed + variance * of_noise
+        return errors[step]
+
+    best = _FIRST_STEP
+    while True:
+        better = min((best - 1, best, best + 1), key=error)
+        if better == best or not _STEPS[0] < better < _STEPS[1]:
+            break
+        best = better
+    below, middle, above = (math.log(errors[best + step]) for step in (-1, 0, 1))
+    curve = below - 2 * middle + above
+    offset = 0.5 * (below - above) / curve if curve > 0 else 0.0
+    return float(UNTOLD * _STEP ** (best + min(max(offset, -0.5), 0.5)))
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
