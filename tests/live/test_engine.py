@@ -83,6 +83,24 @@ def test_without_a_bundle_it_calibrates_itself():
     assert quality(views[-1].image, recording.truth([39])[0]) > 22
 
 
+def test_calibration_waits_for_a_second_where_times_are_given():
+    recording = recorded()
+    engine = LiveEngine()
+    views = [engine.push(frame, 7 + number / 30) for number, frame in enumerate(frames_of(recording))]
+    assert [view.state for view in views] == ["calibrating"] * 30 + ["following"] * 10
+    assert [view.seconds for view in views] == [7 + number / 30 for number in range(40)]
+
+
+def test_a_clock_that_is_set_back_does_not_hold_up_calibration():
+    recording = recorded()
+    engine = LiveEngine()
+    frames = frames_of(recording)
+    for frame in frames[:3]:
+        engine.push(frame, 1000.0)
+    views = [engine.push(frame, number / 20) for number, frame in enumerate(frames[3:25])]
+    assert views[-1].state == "following"
+
+
 def test_lost_contact_is_told_and_it_comes_back():
     recording = recorded()
     engine = LiveEngine(bundle_of(recording))
@@ -123,7 +141,7 @@ def test_frozen_and_white_frames_are_told_at_once():
     assert engine.push(frames[2]).state == "following"
 
 
-def test_brightness_and_bit_depth_may_change():
+def test_light_that_dims_is_told_and_followed():
     recording = recorded()
     engine = LiveEngine(bundle_of(recording))
     frames = frames_of(recording).astype(np.float32) / 255
@@ -156,6 +174,8 @@ def test_what_cannot_be_taken_is_refused_and_live_view_goes_on():
         engine.push(frames[1][:100])
     with pytest.raises(FiberBurstError, match=r"a live frame is \(H, W\)"):
         engine.push(np.zeros(5))
+    with pytest.raises(FiberBurstError, match="the time of a live frame must be finite, in seconds; got nan"):
+        engine.push(frames[1], float("nan"))
     assert engine.push(frames[1]).state == "following"
     with pytest.raises(FiberBurstError, match="the bundle was measured in frames of 141 x 167"):
         LiveEngine(bundle_of(recording)).push(frames[0][:100])

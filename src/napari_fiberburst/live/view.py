@@ -39,6 +39,8 @@ class LiveView:
         Pixels that the probe has gone since the frame before.
     covered : float
         Part of the field's pixels that cores have looked at of late, 0 to 1.
+    seconds : float or None
+        When the newest frame was taken, as it was pushed.
     """
 
     image: NDArray[np.float32]
@@ -50,3 +52,4 @@ class LiveView:
     brightness: float = 1.0
     speed: float = 0.0
     covered: float = 0.0
+    seconds: float | None = None
