@@ -24,11 +24,25 @@ def add_to(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the film."""
-    from napari_fiberburst.recordings.movie import check_movie, write_movie  # torch takes seconds to load
+    from napari_fiberburst.recordings.movie import write_movie  # torch takes seconds to load
 
-    target = check_movie(options.output)
-    if target.exists():
-        raise OutputError(f"{target} is there already; choose another name, or remove it")
+    target = film_target(options.output)
     write_movie(open_recording(options.input, axes=options.axes), target, scale_bar=True)
     print(f"wrote {target}")
     return 0
+
+
+def film_target(path: Path) -> Path:
+    """Return where a film goes.
+
+    Raises
+    ------
+    OutputError
+        A file is there already, or none can be written.
+    """
+    from napari_fiberburst.recordings.movie import check_movie
+
+    target = check_movie(path)
+    if target.exists():
+        raise OutputError(f"{target} is there already; choose another name, or remove it")
+    return target

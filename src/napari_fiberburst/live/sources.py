@@ -40,6 +40,11 @@ class Latest:
 class LiveSource(Protocol):
     """Gives frames while they are taken. The newest wins: whoever comes late gets it, and not what was missed."""
 
+    @property
+    def clock(self) -> Clock:
+        """What the times of frames are read on."""
+        ...
+
     def latest(self, n: int = 1) -> Latest:
         """Wait for a frame that was not handed out before, and return it after up to n - 1 others of that kind."""
         ...
