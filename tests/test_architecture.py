@@ -31,15 +31,16 @@ ALLOWED = {
     "networks": RESULTS | {"coordinates", "operators", "device", "quality", *STEPS},
     "pipeline": RESULTS | {"coordinates", "operators", "device", "steps", "networks", *STEPS},
     "recordings": RESULTS | {"coordinates", "operators", "quality", "steps", "stored", "pipeline", *STEPS},
+    "live": BASE | {"bundle", "operators", "pipeline"},
     "report": RESULTS | {"coordinates", "quality"},
-    "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", "recordings", "report", ""},
+    "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", "recordings", "report", "live", ""},
     "memory": BASE,
     "streaming": set(),
     "plugin": RESULTS
     | {"simulation", "quality", "coordinates", "bundle", "networks", "device", "pipeline", "recordings", "report"}
     | {"memory", "streaming"},
 }
-TORCH = {"stored", "device", "operators", "bundle", "motion", "scene", "networks", "pipeline", "recordings"}
+TORCH = {"stored", "device", "operators", "bundle", "motion", "scene", "networks", "pipeline", "recordings", "live"}
 QT = {"qtpy", "magicgui", "superqt", "napari", "pyqtgraph"}
 
 

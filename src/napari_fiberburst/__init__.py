@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from napari_fiberburst.io import find_doubled as find_doubled
     from napari_fiberburst.io import open_recording as open_recording
     from napari_fiberburst.io import read_burst as read_burst
+    from napari_fiberburst.live.engine import LiveEngine as LiveEngine
+    from napari_fiberburst.live.view import LiveView as LiveView
     from napari_fiberburst.motion.register import refine as refine
     from napari_fiberburst.motion.register import register as register
     from napari_fiberburst.motion.registration import Registration as Registration
@@ -52,6 +54,8 @@ _HOMES = {
     "Diagnostics": "results.diagnostics",
     "FiberBurstError": "errors",
     "FrameSource": "data.source",
+    "LiveEngine": "live.engine",
+    "LiveView": "live.view",
     "Progress": "results.progress",
     "Reconstruction": "results.reconstruction",
     "Registration": "motion.registration",

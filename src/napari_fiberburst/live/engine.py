@@ -1,0 +1,130 @@
+"""LiveEngine: a picture for every frame, sharper with each."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.data.burst import MIN_SIDE
+from napari_fiberburst.errors import BurstError
+from napari_fiberburst.live.calibration import Calibration
+from napari_fiberburst.live.levels import Levels
+from napari_fiberburst.live.probe import Probe
+from napari_fiberburst.live.view import Advice, LiveView, State
+
+# Frames after which half of what was seen is forgotten.
+HALF_LIFE = 20.0
+
+
+class LiveEngine:
+    """Makes a picture for every frame, of that frame and those before it.
+
+    Parameters
+    ----------
+    bundle : Bundle, optional
+        Of the frames. Without, the engine calibrates itself from the first twenty frames that differ, spread over a
+        second at least where their times are given.
+    half_life : float
+        Frames after which half of what was seen is forgotten.
+    black_level, white_level : float, optional
+        Intensities without light and at full scale; by default as `Burst` takes them from the first frame.
+
+    Raises
+    ------
+    BurstError
+        The half-life is not positive.
+
+    Examples
+    --------
+    >>> from napari_fiberburst.simulation import simulate_recording
+    >>> recording = simulate_recording(frames=24, shape=(97, 121), pitch=6.0, path="handheld", step=1.5)
+    >>> engine = LiveEngine()
+    >>> views = [engine.push(frame) for frame in recording.source.recorded(range(24))]
+    >>> views[0].state, views[-1].state, views[-1].image.shape
+    ('calibrating', 'following', (97, 121, 1))
+    """
+
+    def __init__(
+        self,
+        bundle: Bundle | None = None,
+        *,
+        half_life: float = HALF_LIFE,
+        black_level: float | None = None,
+        white_level: float | None = None,
+    ) -> None:
+        if not 0 < half_life < np.inf:
+            raise BurstError(f"the half-life must be a positive number of frames; got {half_life}")
+        self.bundle = bundle
+        self._kept = 0.5 ** (1 / half_life)
+        self._asked_levels = black_level, white_level
+        self._calibration = Calibration(black_level, white_level)
+        self._probe: Probe | None = None
+        self._last: NDArray[Any] | None = None
+        self._view: LiveView | None = None
+
+    def push(self, frame: ArrayLike, seconds: float | None = None) -> LiveView:
+        """Take in the newest frame and return the picture.
+
+        Parameters
+        ----------
+        frame : array_like
+            (H, W) or (H, W, C), integers or floats.
+        seconds : float, optional
+            When it was taken, on any clock.
+
+        Raises
+        ------
+        BurstError
+            It is no frame, or not of the size of the ones before or of the bundle; or its time is not finite. What was
+            seen before stays, and the next frame that fits goes on.
+        """
+        pixels = _checked(frame)
+        if seconds is not None and not math.isfinite(seconds):
+            raise BurstError(f"the time of a live frame must be finite, in seconds; got {seconds}: leave it out")
+        if self._last is not None and pixels.shape != self._last.shape:
+            raise BurstError(
+                f"frames were {_size(self._last)}, but this one is {_size(pixels)}; set the camera back, or begin a "
+                "new live view"
+            )
+        if self._last is not None and np.array_equal(pixels, self._last):
+            return self._told("frozen", "the camera has stopped", pixels, seconds)
+        if self.bundle is None:
+            self.bundle = self._calibration.take(pixels, seconds)
+        if self.bundle is None:
+            self._last = pixels
+            return self._told("calibrating", "wait", pixels, seconds)
+        if self._probe is None or self._probe.dtype != pixels.dtype:
+            self._probe = Probe(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
+        self._last = pixels
+        self._view = replace(self._probe.push(pixels, self._kept), seconds=seconds)
+        return self._view
+
+    def _told(self, state: State, advice: Advice, pixels: NDArray[Any], seconds: float | None) -> LiveView:
+        """Return the last picture, or else the frame as it came, with another state."""
+        before = self._view
+        image = pixels.astype(np.float32) if before is None else before.image
+        return LiveView(
+            image=image,
+            homography=np.eye(3) if before is None else before.homography,
+            state=state,
+            advice=advice,
+            piece=0 if before is None else before.piece,
+            seconds=seconds,
+        )
+
+
+def _checked(frame: ArrayLike) -> NDArray[Any]:
+    pixels = np.asarray(frame)
+    if pixels.dtype.kind not in "uif" or pixels.ndim not in (2, 3) or min(pixels.shape[:2]) < MIN_SIDE:
+        raise BurstError(
+            f"a live frame is (H, W) or (H, W, C), {MIN_SIDE} pixels a side at least, integers or floats; got shape "
+            f"{pixels.shape} of {pixels.dtype}"
+        )
+    return pixels
+
+
+def _size(pixels: NDArray[Any]) -> str:
+    return " x ".join(map(str, pixels.shape))

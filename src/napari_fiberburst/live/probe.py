@@ -1,0 +1,187 @@
+"""One bundle at one bit depth: what is made once of it, and the scene behind it as it stands."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.errors import BurstError
+from napari_fiberburst.live.following import Finder, Fit, fit
+from napari_fiberburst.live.levels import Levels
+from napari_fiberburst.live.memory import Memory
+from napari_fiberburst.live.pose import Pose
+from napari_fiberburst.live.sampling import CoreLight, CoreSampler
+from napari_fiberburst.live.sharpening import Sharpener
+from napari_fiberburst.live.view import Advice, LiveView, State
+
+# Steps of conjugate gradients for the first frame of a scene, and for each later one.
+_FIRST_STEPS, _STEPS = 30, 4
+# A frame belongs to the scene where it is this much like it. After so many frames that are not, a new one begins.
+_LEAST_ALIKE, _PATIENCE = 0.6, 2
+# Contact is lost where cores differ by less than this part of what they usually do, relative to full scale.
+_LEAST_CONTRAST, _FAINT = 0.35, 1e-3
+# Part of the cores that may be saturated, or unreadable.
+_MOST_GLARE, _MOST_UNREADABLE = 0.05, 0.5
+# A step of more than this part of the field's shorter side is too fast.
+_MOST_STEP = 0.2
+# Part of the field that has been looked at where there is no need to move.
+_ENOUGH_COVERED, _SEEN = 0.7, 0.02
+# With less of the field looked at, frames are fitted to the scene blurred by this Gaussian, pitches.
+_FEW_COVERED, _SOFT = 0.8, 0.6
+# Farther than so many pitches from a core nothing is drawn.
+_REACH = 1.0
+# A turn or a zoom that moves corners by more than so many pixels begins a new scene, upright in the newest frame.
+_MOST_TURN = 6.0
+
+
+class Probe:
+    """One bundle at one bit depth: all that is made once, and the scene."""
+
+    def __init__(self, bundle: Bundle, pixels: NDArray[Any], levels: Levels) -> None:
+        if bundle.shape != pixels.shape[:2]:
+            raise BurstError(
+                f"the bundle was measured in frames of {bundle.shape[0]} x {bundle.shape[1]} pixels, and the camera "
+                f"gives {pixels.shape[0]} x {pixels.shape[1]}; set it as for the bundle, or leave the bundle out"
+            )
+        self.dtype = pixels.dtype
+        self._bundle, self._levels = bundle, levels
+        self._shape = bundle.shape
+        self._sampler = CoreSampler(bundle, levels)
+        self._positions = bundle.centres[:, 0] + 1j * bundle.centres[:, 1]
+        self._finder = Finder(bundle.centres, self._shape, bundle.pitch)
+        channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+        area = float(max(1, bundle.outline.sum()))
+        self._memory = Memory(self._shape, bundle.pitch, area, channels)
+        self._sharpener = Sharpener(self._memory, bundle.radius)
+        y, x = np.indices(self._shape)
+        pixel = np.stack([x.ravel(), y.ravel()], axis=1)
+        distance = cKDTree(bundle.centres).query(pixel, distance_upper_bound=_REACH * bundle.pitch)[0]
+        self._beyond = ~np.isfinite(distance).reshape(self._shape)
+        self._pose = Pose.at_rest(self._shape)
+        self._base = np.eye(3)
+        self._spectrum: NDArray[np.complex64] | None = None
+        self._usual_contrast, self._brightness = 0.0, 1.0
+        self._missed, self._piece, self._seen_part = 0, 0, 0.0
+        self._image = np.full((*self._shape, channels), np.nan, np.float32)
+        self._is_grey = pixels.ndim == 2
+
+    def push(self, pixels: NDArray[Any], kept: float) -> LiveView:
+        """Take in a frame and return the picture."""
+        light = self._sampler(pixels.reshape(*self._shape, -1))
+        grey = light.grey
+        if light.glare > _MOST_GLARE:
+            return self._missing("too bright")
+        contrast = float(grey[light.weights > 0].std()) if (light.weights > 0).any() else 0.0
+        if light.unreadable > _MOST_UNREADABLE or contrast < max(_FAINT, 0.1 * self._usual_contrast):
+            return self._missing("out of contact")
+        spectrum = self._finder.spectrum(grey)
+        if self._spectrum is None:
+            return self._begun(light, spectrum, contrast)
+        found, shift = self._found(light, grey, spectrum)
+        if found.alike < _LEAST_ALIKE:
+            if contrast < _LEAST_CONTRAST * self._usual_contrast:
+                return self._missing("out of contact")
+            self._missed += 1
+            if self._missed < _PATIENCE:
+                return self._view("lost", "too fast", found.alike)
+            self._piece += 1
+            return self._begun(light, spectrum, contrast)
+        self._base_on(found.pose, light)
+        self._missed, self._spectrum = 0, spectrum
+        self._usual_contrast += 0.1 * (contrast - self._usual_contrast)
+        self._brightness = found.brightness
+        self._add(light, kept, _FIRST_STEPS if self._is_new else _STEPS)
+        self._seen_part = covered = self._covered()
+        return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
+
+    def _found(
+        self, light: CoreLight, grey: NDArray[np.float32], spectrum: NDArray[np.complex64]
+    ) -> tuple[Fit, complex]:
+        """Return how a frame lies on the scene, and how far from the one before."""
+        assert self._spectrum is not None
+        shift, _ = self._finder.shift(self._spectrum, spectrum)
+        memory = self._memory
+        scene = memory.scene.mean(dim=0).numpy()
+        is_young = self._seen_part < _FEW_COVERED
+        if is_young:
+            # What lies between few cores is drawn from them, and would hold the next frame where it draws them.
+            scene = gaussian_filter(scene, _SOFT * self._bundle.pitch)
+        found = fit(
+            grey,
+            light.weights,
+            self._positions,
+            scene,
+            memory.weight.numpy(),
+            memory.nodes,
+            self._pose.moved(shift * self._pose.turn),
+            turns=not is_young,
+        )
+        return found, found.pose.place - self._pose.place
+
+    def _begun(self, light: CoreLight, spectrum: NDArray[np.complex64], contrast: float) -> LiveView:
+        """Begin a new scene with a frame."""
+        self._memory.clear(light.values.shape[1])
+        self._pose, self._base = Pose.at_rest(self._shape), np.eye(3)
+        self._missed, self._spectrum, self._brightness = 0, spectrum, 1.0
+        self._usual_contrast, self._seen_part = contrast, 0.0
+        self._is_new = True
+        self._add(light, 1.0, _FIRST_STEPS)
+        return self._view("following", "move a little", 1.0, 0.0, self._covered())
+
+    def _base_on(self, pose: Pose, light: CoreLight) -> None:
+        """Take a pose; begin a new scene, upright in this frame, where it has turned too far from the old one."""
+        self._is_new = pose.corner_motion() > _MOST_TURN
+        if self._is_new:
+            self._base = self._base @ pose.matrix
+            pose = Pose.at_rest(self._shape)
+            self._memory.clear(light.values.shape[1])
+        self._pose = pose
+
+    def _add(self, light: CoreLight, kept: float, steps: int) -> None:
+        memory, height, width = self._memory, *self._shape
+        corner = self._pose.place - self._pose.middle
+        memory.centre_on(corner, corner + complex(width - 1, height - 1))
+        memory.forget(kept)
+        brightness = np.float32(self._brightness)
+        points = self._pose.points(self._positions)
+        memory.add(points, light.values / brightness, light.weights * brightness**2)
+        if self._is_new:
+            memory.start(0.5 * self._bundle.pitch)
+        memory.solve(steps)
+        picture = self._sharpener(memory, self._pose, self._shape)
+        picture = picture * np.float32(self._brightness * self._levels.span) + np.float32(self._bundle.black)
+        picture[self._beyond] = np.nan
+        self._image = picture
+
+    def _covered(self) -> float:
+        """Return which part of the middle of the field has been looked at."""
+        rows, columns = self._memory.nodes.rows, self._memory.nodes.columns
+        middle = self._memory.weight[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
+        return float((middle > _SEEN).to(torch.float32).mean())
+
+    def _advised(self, step: float, covered: float) -> Advice:
+        if step > _MOST_STEP * min(self._shape):
+            return "too fast"
+        return "fine" if covered > _ENOUGH_COVERED else "move a little"
+
+    def _missing(self, advice: Advice) -> LiveView:
+        return self._view("lost", advice)
+
+    def _view(
+        self, state: State, advice: Advice, alike: float = 0.0, speed: float = 0.0, covered: float = 0.0
+    ) -> LiveView:
+        return LiveView(
+            image=self._image[..., 0] if self._is_grey else self._image,
+            homography=self._base @ self._pose.matrix,
+            state=state,
+            advice=advice,
+            piece=self._piece,
+            alike=alike,
+            brightness=self._brightness,
+            speed=speed,
+            covered=covered,
+        )
