@@ -25,7 +25,7 @@ from napari_fiberburst.steps import drain
 
 # Iterations of conjugate gradients for an image that somebody waits for: at ten times the smoothness it is off by a
 # thousandth of full scale then, and what it was before by twenty.
-_ITERATIONS = 12
+_ITERATIONS = 14
 
 
 class Again:

@@ -32,9 +32,9 @@ _WINDOW = 224
 # these.
 _STEP, _FIRST_STEP, _STEPS = 3.0, -2, (-6, 4)
 _REHEARSED_ITERATIONS = 16
-# Halves are rehearsed once more where the first time takes more than this part from the noise: much of it was gaps.
-_REHEARSALS, _SETTLED = 2, 0.75
-# More tell no more, because what these pass is measured.
+# At least this part of what halves differ by is taken for noise: a small rest of large numbers tells nothing.
+_LEAST_OWN = 0.25
+# Of the halves; more tell no more, because what these pass is measured.
 _ROUGH_ITERATIONS = 25
 # Every core is left out once, with so many others that most of its neighbours stay.
 _FOLDS = 6
@@ -98,7 +98,11 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = liveliest(grid, scene, _WINDOW)
-    halves = [among_frames(half, samples) for half in (frames[::2], frames[1::2])]
+    # What is drawn at random depends on how many frames there are, and those that take no part must not count.
+    there = torch.from_numpy(frames).to(points.device)
+    samples = replace(samples, values=samples.values[there], weights=samples.weights[there])
+    points, numbers = points[there], np.arange(len(frames))
+    halves = [among_frames(half, samples) for half in (numbers[::2], numbers[1::2])]
 
     def equations_of(some: Samples) -> list[NormalEquations]:
         return [assemble(window, some, points, half) for half in halves]
@@ -116,18 +120,12 @@ def choose_smoothness(
     passed, prior = solved[0].responses(spectra.frequency)
     density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in solved]))
 
-    power, variance = _told(spectra, _as_if_even(passed, prior, density), passed)
-    for _ in range(_REHEARSALS):
-        rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
-        passing = _measured(
-            rehearsal, [_hardly_smoothed(half) for half in equations_of(rehearsal.scene_and_noise)], soft
-        )
-        before = variance
-        power, variance = _told(spectra, passing, passed)
-        if variance > _SETTLED * before:
-            break
+    power, _ = _told(spectra, _as_if_even(passed, prior, density), passed)
     rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
-    equations = assemble(window, rehearsal.samples, points, among_frames(frames, samples))
+    passing = _measured(rehearsal, [_hardly_smoothed(half) for half in equations_of(rehearsal.scene_and_noise)], soft)
+    power, variance = _told(spectra, passing, passed)
+    rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
+    equations = assemble(window, rehearsal.samples, points)
     in_grey = ring_spectra(images[0].mean(axis=0), images[1].mean(axis=0), soft)
     return Smoothness(_least_error(rehearsal, equations, variance), correlation_of(in_grey).in_pixels(window.spacing))
 
@@ -183,7 +181,7 @@ def _told(spectra: RingSpectra, passing: _Passing, passed: NDArray[np.float64]) 
     """
     count, scene, noise = spectra.count[1:], passing.scene[1:], passing.noise[1:]
     power = fit_power(spectra.frequency[1:], spectra.cross[1:], spectra.noise[1:], count, scene)
-    own = np.maximum(spectra.noise[1:] - passing.gaps[1:], 0)
+    own = np.maximum(spectra.noise[1:] - passing.gaps[1:], _LEAST_OWN * spectra.noise[1:])
     return power, weighted_median(own / np.maximum(noise, np.finfo(float).tiny), count * passed[1:] * scene)
 
 
