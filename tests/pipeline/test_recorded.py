@@ -57,7 +57,7 @@ def test_flicker_is_taken_out(clean, flicker):
     result = reconstruct(simulated.burst)
     np.testing.assert_allclose(result.exposures, simulated.exposures, rtol=0.01)
     # In so small a field, cores' gains tell the slope of the light to a per cent only.
-    assert quality(result, simulated) > clean[2] - 1.3
+    assert quality(result, simulated) > clean[2] - 1.5
     assert result.quality == "good"
 
 
