@@ -1,7 +1,10 @@
 """Smoothness that is chosen, against images of known scenes through known bundles at known motion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 
 from napari_fiberburst import Bundle, Registration, render, sample, solve
 from napari_fiberburst.quality import psnr
@@ -40,3 +43,13 @@ def test_the_smoothness_that_is_chosen_is_nearly_as_good_as_the_best(scene, phot
     chosen, smoothness = quality(None)
     best = max(quality(smoothness * factor)[0] for factor in (0.1, 0.3, 3.0))
     assert chosen > best - 0.6
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5])
+def test_an_even_scene_without_noise_says_nothing_and_is_solved(level):
+    made = simulate("histology", shape=(91, 104), frames=6, channels=1, pitch=5.0, physics="core", seed=2)
+    samples = sample(made.burst, Bundle.from_image(np.round(made.flat * 255)))
+    even = replace(samples, values=torch.full_like(samples.values, level))
+    scene = solve(even, Registration.known(made.homographies, samples.shape, samples.cores))
+    assert 0 < scene.smoothness < np.inf
+    assert torch.isfinite(scene.coefficients).all()

@@ -90,11 +90,11 @@ class Probe:
                 return self._view("lost", "too fast", found.alike)
             self._piece += 1
             return self._begun(light, spectrum, contrast)
-        self._base_on(found.pose, light)
+        is_new = self._base_on(found.pose, light)
         self._missed, self._spectrum = 0, spectrum
         self._usual_contrast += 0.1 * (contrast - self._usual_contrast)
         self._brightness = found.brightness
-        self._add(light, kept, _FIRST_STEPS if self._is_new else _STEPS)
+        self._add(light, kept, is_new=is_new)
         self._seen_part = covered = self._covered()
         return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
 
@@ -128,20 +128,20 @@ class Probe:
         self._pose, self._base = Pose.at_rest(self._shape), np.eye(3)
         self._missed, self._spectrum, self._brightness = 0, spectrum, 1.0
         self._usual_contrast, self._seen_part = contrast, 0.0
-        self._is_new = True
-        self._add(light, 1.0, _FIRST_STEPS)
+        self._add(light, 1.0, is_new=True)
         return self._view("following", "move a little", 1.0, 0.0, self._covered())
 
-    def _base_on(self, pose: Pose, light: CoreLight) -> None:
-        """Take a pose; begin a new scene, upright in this frame, where it has turned too far from the old one."""
-        self._is_new = pose.corner_motion() > _MOST_TURN
-        if self._is_new:
+    def _base_on(self, pose: Pose, light: CoreLight) -> bool:
+        """Take a pose; begin a new scene, upright in this frame, where it has turned too far, and return whether."""
+        is_new = pose.corner_motion() > _MOST_TURN
+        if is_new:
             self._base = self._base @ pose.matrix
             pose = Pose.at_rest(self._shape)
             self._memory.clear(light.values.shape[1])
         self._pose = pose
+        return is_new
 
-    def _add(self, light: CoreLight, kept: float, steps: int) -> None:
+    def _add(self, light: CoreLight, kept: float, *, is_new: bool) -> None:
         memory, height, width = self._memory, *self._shape
         corner = self._pose.place - self._pose.middle
         memory.centre_on(corner, corner + complex(width - 1, height - 1))
@@ -149,9 +149,9 @@ class Probe:
         brightness = np.float32(self._brightness)
         points = self._pose.points(self._positions)
         memory.add(points, light.values / brightness, light.weights * brightness**2)
-        if self._is_new:
+        if is_new:
             memory.start(0.5 * self._bundle.pitch)
-        memory.solve(steps)
+        memory.solve(_FIRST_STEPS if is_new else _STEPS)
         picture = self._sharpener(memory, self._pose, self._shape)
         picture = picture * np.float32(self._brightness * self._levels.span) + np.float32(self._bundle.black)
         picture[self._beyond] = np.nan

@@ -36,6 +36,8 @@ _REHEARSED_ITERATIONS = 16
 _LEAST_OWN = 0.25
 # Of the halves; more tell no more, because what these pass is measured.
 _ROUGH_ITERATIONS = 25
+# Halves that have less power than this in common, at full scale 1, show nothing but how numbers are rounded.
+_NOTHING = 1e-13
 # Every core is left out once, with so many others that most of its neighbours stay.
 _FOLDS = 6
 
@@ -117,6 +119,10 @@ def choose_smoothness(
     soft = (blur(sampled.to(scene), 4.0) * sampled).cpu().numpy()
     images = [_hardly_smoothed(half) for half in solved]
     spectra = _mean_spectra(images[0], images[1], soft)
+    in_grey = ring_spectra(images[0].mean(axis=0), images[1].mean(axis=0), soft)
+    agreement = correlation_of(in_grey).in_pixels(window.spacing)
+    if not spectra.cross[1:].max() > _NOTHING:
+        return Smoothness(UNTOLD, agreement)
     passed, prior = solved[0].responses(spectra.frequency)
     density = float(np.mean([float(steady.mean(half.density()[sampled])) for half in solved]))
 
@@ -126,8 +132,7 @@ def choose_smoothness(
     power, variance = _told(spectra, passing, passed)
     rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
     equations = assemble(window, rehearsal.samples, points)
-    in_grey = ring_spectra(images[0].mean(axis=0), images[1].mean(axis=0), soft)
-    return Smoothness(_least_error(rehearsal, equations, variance), correlation_of(in_grey).in_pixels(window.spacing))
+    return Smoothness(_least_error(rehearsal, equations, variance), agreement)
 
 
 def _without_mean(samples: Samples) -> Samples:
@@ -163,7 +168,7 @@ def _as_if_even(passed: NDArray[np.float64], prior: NDArray[np.float64], density
 def _measured(rehearsal: Rehearsal, images: list[NDArray[np.float32]], soft: NDArray[np.float32]) -> _Passing:
     """Return what halves pass of a scene that is known, and of noise."""
     nodes = rehearsal.nodes.cpu().numpy()
-    there = ring_spectra(nodes, nodes, soft).cross
+    there = np.maximum(ring_spectra(nodes, nodes, soft).cross, np.finfo(float).tiny)
     shown = [np.maximum(ring_spectra(image[0], nodes, soft).cross / there, 0) for image in images]
     return _Passing(
         scene=shown[0] * shown[1],
