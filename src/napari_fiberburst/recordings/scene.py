@@ -24,8 +24,6 @@ from napari_fiberburst.scene.spline import NormalEquations, assemble
 _SAMPLES_TOGETHER = 200_000
 # The smoothness is chosen in a window of so many nodes a side, from so many frames at most.
 _WINDOW, _FRAMES_TOLD = 224, 200
-# Halves that share no core have half as many samples, and ask for about this much more smoothness than is best for all.
-_LESS_DENSE = 0.5
 # Samples that the scene misses by more than this many times its usual error show something else.
 _OUTLIER = 5.0
 
@@ -103,7 +101,7 @@ def told_by(traces: Traces, track: Track, piece: int) -> Told:
     halves = np.arange(len(touching))
     chosen = choose_smoothness(samples, points, halves, window, empty)
     apart = choose_smoothness(_of_two_bundles(samples), points, halves, window, empty)
-    return Told(smoothness=max(chosen.weight, _LESS_DENSE * apart.weight), agreement=apart.agreement)
+    return Told(smoothness=max(chosen.weight, apart.weight), agreement=apart.agreement)
 
 
 def _of_two_bundles(samples: Samples) -> Samples:
