@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.lazy import Handle, Parts
 from napari_fiberburst.io.recording import Recording, with_time
+from napari_fiberburst.io.results import write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -64,6 +65,33 @@ def describe_tiff(path: Path) -> dict[str, Any]:
             return _described(file, series.shape[axes.index("T")] if "T" in axes else 1)
     except Exception as error:  # as in `read_tiff`
         raise BurstError(f"{path} cannot be read as TIFF ({error}); copy or export it again") from error
+
+
+def write_frames(
+    path: Path,
+    frames: NDArray[Any],
+    times: NDArray[np.float64],
+    pixel_size: tuple[float, float] | None = None,
+    unit: str | None = None,
+) -> None:
+    """Write frames (T, H, W, C) as they are, and when they were taken in seconds, as OME-TIFF.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    is_colour = frames.shape[3] == 3 and frames.dtype == np.uint8
+    shown, axes = (frames, "TYXS") if is_colour else (frames.transpose(0, 3, 1, 2), "TCYX")
+    planes = len(frames) * (1 if is_colour else frames.shape[3])
+    seconds = np.repeat(times - times[0], planes // len(frames)).tolist()
+    described: dict[str, Any] = {"axes": axes, "Plane": {"DeltaT": seconds, "DeltaTUnit": ["s"] * planes}}
+    if pixel_size is not None:
+        height, width = pixel_size
+        described |= {"PhysicalSizeY": height, "PhysicalSizeX": width, "PhysicalSizeXUnit": unit or "µm"}
+        described["PhysicalSizeYUnit"] = unit or "µm"
+    with write_whole(path) as stream:
+        tifffile.imwrite(stream, shown, ome=True, photometric="rgb" if is_colour else "minisblack", metadata=described)
 
 
 def _is_cut_short(file: tifffile.TiffFile) -> bool:

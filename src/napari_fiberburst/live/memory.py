@@ -86,6 +86,11 @@ class Memory:
         there_y, here_y = _overlap(old.y0, self.nodes.y0, old.rows)
         there_x, here_x = _overlap(old.x0, self.nodes.x0, old.columns)
         self._planes[:, here_y, here_x] = before[:, there_y, there_x]
+        # What couples to nodes that fell out must not couple to those that come in their place: these have not been
+        # seen, and the matrix would not be positive any more.
+        self._planes[2:_BANDS, -1] = 0
+        self._planes[[1, 3], :, -1] = 0
+        self._planes[4, :, 0] = 0
         self._tie(tied)
         along_y, along_x = (
             (torch.arange(count) + new - start).clamp(0, count - 1)

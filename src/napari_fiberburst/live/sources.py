@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from threading import Event
 from typing import Any, Protocol
 
 import numpy as np
@@ -49,6 +50,10 @@ class LiveSource(Protocol):
         """Wait for a frame that was not handed out before, and return it after up to n - 1 others of that kind."""
         ...
 
+    def close(self) -> None:
+        """End: whoever waits for a frame, and whoever asks later, gets none. May be called from another thread."""
+        ...
+
 
 class Replay:
     """Replays a recording as if it were taken now, the first frame when it is first asked for.
@@ -83,6 +88,11 @@ class Replay:
         self._source = source
         self._began: float | None = None
         self._next = 0
+        self._closed = Event()
+
+    def close(self) -> None:
+        """End before the recording does."""
+        self._closed.set()
 
     def latest(self, n: int = 1) -> Latest:
         """Wait for the next frame, and return up to n of those that have come; none after the recording's last.
@@ -105,12 +115,12 @@ class Replay:
 
     def _wait(self, began: float) -> int:
         """Return how many frames have come, once the next one has; at the end, all."""
-        while self._next < len(self._source):
+        while self._next < len(self._source) and not self._closed.is_set():
             since = (self.clock.now() - began) * self.rate + _ROUNDING
             if since >= self._next:
                 return min(len(self._source), int(since) + 1)
             self.clock.wait((self._next - since) / self.rate)
-        return len(self._source)
+        return self._next
 
     def _none(self) -> NDArray[Any]:
         return np.empty((0, *self._source.shape[1:]), self._source.acquisition.dtype)

@@ -21,6 +21,7 @@ from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 from napari_fiberburst.plugin.bursts import guess_axes
 from napari_fiberburst.plugin.contributions import PLUGIN
 from napari_fiberburst.plugin.film import ask_and_save
+from napari_fiberburst.plugin.tasks.live import LiveTask
 from napari_fiberburst.plugin.tasks.long import LongTask
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Command:
 
 def _going(dock: Any) -> Any:
     """Return the task whose run is meant: the one that is shown, or else that which makes pictures."""
-    return dock.task if isinstance(dock.task, LongTask) else dock.picture
+    return dock.task if isinstance(dock.task, LongTask | LiveTask) else dock.picture
 
 
 COMMANDS = {
@@ -102,7 +103,7 @@ class KeyHints(QObject):
         super().__init__(dock)
         self._names: dict[QObject, list[str]] = {task.start_button: ["start"] for task in dock.tasks}
         for task in dock.tasks:
-            if isinstance(task, LongTask):
+            if isinstance(task, LongTask | LiveTask):
                 self._names |= {task.pause_button: ["pause"], task.stop_button: ["stop"]}
         for name, command in COMMANDS.items():
             names = self._names.setdefault(command.widget(dock), [])

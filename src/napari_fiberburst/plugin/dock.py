@@ -12,6 +12,7 @@ from napari_fiberburst.plugin.input_box import InputBox
 from napari_fiberburst.plugin.pickers import WheelFilter
 from napari_fiberburst.plugin.sections import Column, order_tabs
 from napari_fiberburst.plugin.tasks import TASKS
+from napari_fiberburst.plugin.tasks.live import LiveTask
 from napari_fiberburst.plugin.tasks.picture import PictureTask
 from napari_fiberburst.plugin.tasks.task import Task
 
@@ -57,15 +58,21 @@ class FiberBurstWidget(QWidget):
         self.input.changed.connect(self._show_or_invite)
         for task in self.tasks:
             task.kept_changed.connect(self._show_or_invite)
+        self.empty.live_button.clicked.connect(lambda: self.choose_task(LiveTask))
+        self.live.burst_kept.connect(self._take_kept)
         bind_keys()
         KeyHints(self)
         self._show_task(0)
-        self._show_or_invite()
 
     @property
     def picture(self) -> PictureTask:
         """The task that reconstructs, which commands of the Layers menu start."""
         return next(task for task in self.tasks if isinstance(task, PictureTask))
+
+    @property
+    def live(self) -> LiveTask:
+        """The task that shows a camera."""
+        return next(task for task in self.tasks if isinstance(task, LiveTask))
 
     @property
     def task(self) -> Task:
@@ -89,6 +96,7 @@ class FiberBurstWidget(QWidget):
     def reset_choices(self) -> None:
         """Follow the viewer's layers; napari calls this when one is added, removed, moved or renamed."""
         self.input.reset_choices()
+        self.live.source.layer.reset_choices()
 
     def sizeHint(self) -> QSize:
         """Ask for a narrow dock: the image is what matters."""
@@ -106,15 +114,23 @@ class FiberBurstWidget(QWidget):
             self._was_docked = self.parent() is not None
         return super().event(event)
 
+    def _take_kept(self, layer: "Layer") -> None:
+        """Go on with frames that were kept of a live view."""
+        self.reset_choices()
+        self.input.burst.value = layer
+        self.choose_task(PictureTask)
+
     def _show_task(self, number: int) -> None:
         for task in self.tasks:
             task.setVisible(task is self.tasks[number])
-        self.input.frames.set_wanted(is_wanted=self.tasks[number].needs_burst)
-        self.glance.setVisible(self.tasks[number].needs_burst)
+        shown = self.tasks[number]
+        self.input.set_wanted(is_burst_wanted=shown.needs_burst, are_frames_wanted=shown.needs_frames)
+        self.glance.setVisible(shown.needs_burst)
+        self._show_or_invite()
 
     def _show_or_invite(self) -> None:
-        """Show what can be done with a burst, and what is kept of runs; offer to open one where there is none."""
-        is_without = self.input.burst.value is None
+        """Show what can be done with a burst, and what is kept of runs; offer to open one where it is missing."""
+        is_without = self.task.needs_frames and self.input.burst.value is None
         self.empty.setVisible(is_without)
         self.filled.setVisible(not is_without or not all(task.is_empty for task in self.tasks))
         self.glance.set_brief(is_brief=not self.picture.is_empty)

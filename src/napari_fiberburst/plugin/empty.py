@@ -36,6 +36,8 @@ class EmptyBox(QWidget):
     ----------
     open_button, folder_button, sample_button : QPushButton
         Locked while something is opened.
+    live_button : QPushButton
+        For whoever wants to see a camera.
     words : QLabel
         What to do, or why something could not be opened.
     """
@@ -47,10 +49,11 @@ class EmptyBox(QWidget):
         self.words.setWordWrap(True)
         self.words.setTextInteractionFlags(Qt.TextInteractionFlag.TextSelectableByMouse)
         self.open_button, self.folder_button = QPushButton("Open…"), QPushButton("Open folder…")
-        self.sample_button = QPushButton("Try a sample")
+        self.sample_button, self.live_button = QPushButton("Try a sample"), QPushButton("Live…")
         self.open_button.setToolTip("Open a video, a TIFF stack, or a burst of fiberburst simulate.")
         self.folder_button.setToolTip("Open a folder of PNG or TIFF frames, or an OME-Zarr image.")
         self.sample_button.setToolTip("Simulate a burst whose truth is known.")
+        self.live_button.setToolTip("See the picture of a camera while the probe is held; a simulated one will do.")
         self.samples = QMenu(self.sample_button)
         self.samples.aboutToShow.connect(self._list_samples)
         self.sample_button.setMenu(self.samples)
@@ -58,7 +61,7 @@ class EmptyBox(QWidget):
         column.setContentsMargins(0, 0, 0, 0)
         column.addWidget(self.words)
         column.addLayout(row_of(self.open_button, self.folder_button))
-        column.addWidget(self.sample_button)
+        column.addLayout(row_of(self.sample_button, self.live_button))
         self.open_button.clicked.connect(self._ask_for_file)
         self.folder_button.clicked.connect(self._ask_for_folder)
 

@@ -138,6 +138,12 @@ class InputBox(QWidget):
         (row, _), (column, _) = source.region or ((0, 0), (0, 0))
         return Placement.of(self.layers, source.axes, (row, column), source.chosen)
 
+    def set_wanted(self, *, is_burst_wanted: bool, are_frames_wanted: bool) -> None:
+        """Show what a task takes: a burst, some frames of it, or nothing but its bundle."""
+        self._first.setRowVisible(self.burst.native, are_frames_wanted)
+        self.more.setVisible(are_frames_wanted)
+        self.frames.set_wanted(is_wanted=is_burst_wanted)
+
     def set_enabled(self, is_enabled: bool) -> None:
         """Lock or unlock what a running fit has taken."""
         for picker in (self.burst, self.bundle, self.region):
@@ -163,7 +169,7 @@ class InputBox(QWidget):
         self.axes.setAccessibleName("axes")
         self.channels.setAccessibleName("further channels")
         self.channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
-        first = form_layout()
+        self._first = first = form_layout()
         first.addRow("burst", self.burst.native)
         bundle_row = row_of(self.bundle.native, self.open_button)
         bundle_row.setStretch(0, 1)

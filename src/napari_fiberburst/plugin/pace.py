@@ -1,5 +1,7 @@
 """How often something may be drawn, so that drawing leaves the time to the fit."""
 
+import time
+
 # Nobody shall wait longer than this for the next drawing, however slow they are.
 _LONGEST_WAIT = 2.0
 
@@ -31,3 +33,7 @@ class Pace:
         """Take in how long a drawing took."""
         self._drawn = ended
         self._took = (*self._took[-1:], ended - began)
+
+    def note_end(self, began: float) -> None:
+        """Take in a drawing that ends now, on the clock of `time.perf_counter`."""
+        self.note(began, time.perf_counter())

@@ -141,7 +141,7 @@ class Runner(QObject):
                 signal.emit(report)
                 self._show_progress(report)
                 # Comes back once the window has been drawn.
-                QTimer.singleShot(0, partial(_note_drawing, pace, began))
+                QTimer.singleShot(0, partial(pace.note_end, began))
 
     def _show_progress(self, report: "Progress") -> None:
         bar = self._progress
@@ -187,10 +187,6 @@ class Runner(QObject):
 def _paces() -> tuple[Pace, Pace]:
     """Return how often images may be drawn, and all else."""
     return Pace(_IMAGES_SHARE), Pace(_WORDS_SHARE)
-
-
-def _note_drawing(pace: Pace, began: float) -> None:
-    pace.note(began, time.perf_counter())
 
 
 def wait_for_workers() -> None:

@@ -32,11 +32,14 @@ class Task(QWidget):
         How the task is called, and what it does.
     needs_burst : bool
         Whether it works on a burst, some frames of a recording; or else on all of it.
+    needs_frames : bool
+        Whether it works on frames that have been opened; or else it gets its own.
     start_button : QPushButton
         Starts it, in another thread.
     """
 
     needs_burst: ClassVar[bool] = True
+    needs_frames: ClassVar[bool] = True
     title: ClassVar[str]
     tip: ClassVar[str]
     kept_changed = Signal()  # whether `is_empty` may have
