@@ -56,6 +56,7 @@ bench-plugin: .venv/gui
 screenshots: .venv/dev
 	$(BIN)/python examples/show_the_plugin.py docs/plugin
 	$(BIN)/python examples/record_the_plugin.py docs/plugin.gif
+	$(BIN)/python examples/record_live.py docs/live.gif
 
 # The site, in site/; what is wrong in it is an error.
 docs: .venv/docs

@@ -1,7 +1,7 @@
 """How the plugin keeps up with the script: first image, speed, how long the window is held up, and what is left behind.
 
 Runs in a window that is drawn, under Xvfb on a machine without a display: `xvfb-run python benchmarks/plugin.py`. All
-of it, or the parts that are named behind: speed, switches, runs, leaks.
+of it, or the parts that are named behind: speed, switches, runs, leaks, live.
 """
 
 import gc
@@ -20,6 +20,7 @@ from qtpy.QtWidgets import QApplication
 from napari_fiberburst import reconstruct
 from napari_fiberburst.plugin.contributions import make_sample
 from napari_fiberburst.plugin.dock import FiberBurstWidget
+from napari_fiberburst.plugin.tasks.live import LiveTask
 from napari_fiberburst.simulation import simulate
 
 ROUNDS = 3
@@ -27,6 +28,7 @@ ROUNDS = 3
 FITS: dict[str, dict[str, Any]] = {"auto": {}, "paper, 100 steps": {"preset": "paper", "iterations": 100}}
 CYCLES = 100
 KEPT = 50
+LIVE_SECONDS = 10
 # What a large result's card does takes as long whatever the run came to.
 LARGE, SHORT = (1024, 1024), {"motion": "translation", "iterations": 1}
 MEBIBYTE = 2**20
@@ -166,6 +168,32 @@ def _resident() -> float:
     return psutil.Process().memory_info().rss / MEBIBYTE
 
 
+def measure_live() -> None:
+    """Watch the simulated camera for ten seconds: pictures made and shown, their lag, how long the window is away."""
+    viewer, dock, _ = open_window(is_drawn=True)
+    dock.choose_task(LiveTask)
+    dock.live.start()
+    wait_until(lambda: dock.live.words.text() == "Good", 120)
+    pulse, began, job, layers = Heartbeat(), time.perf_counter(), dock.live.job, dock.live._layers
+    assert job is not None
+    assert layers is not None
+    shown, rates, lags = layers.shown, [], []
+    while (seconds := time.perf_counter() - began) < LIVE_SECONDS:
+        wait_until(lambda: False, 0.5)
+        rates.append(dock.live.rate)
+        lags.append(1e3 * dock.live.lag)
+    _, gaps = pulse.stop([])
+    dock.live.stop()
+    wait_until(lambda: dock.live.job is None)
+    shown_rate = (layers.shown - shown) / seconds
+    print(
+        f"live, 30 frames of 256 x 256 a second: {sum(rates) / len(rates):.0f} pictures made and {shown_rate:.0f} "
+        f"shown a second, lag {sorted(lags)[len(lags) // 2]:.0f} ms in the median; window away {gaps[0]:.0f} ms at "
+        f"most, {gaps[len(gaps) // 100]:.0f} in the 99th percentile"
+    )
+    viewer.close()
+
+
 def measure_leaks() -> None:
     """Print what is left after runs that were removed, and after many starts and stops; nothing is drawn here."""
     viewer, dock, _ = open_window(is_drawn=False)
@@ -208,7 +236,13 @@ def open_window(*, is_drawn: bool) -> tuple[Any, FiberBurstWidget, Any]:
     return viewer, dock, frames
 
 
-PARTS = {"speed": measure_speed, "switches": measure_switches, "runs": measure_runs, "leaks": measure_leaks}
+PARTS = {
+    "speed": measure_speed,
+    "switches": measure_switches,
+    "runs": measure_runs,
+    "leaks": measure_leaks,
+    "live": measure_live,
+}
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 # They open the real window on a whole sample; what they do there is asserted by tests/plugin.
-ON_SCREEN = {"record_the_plugin", "show_the_plugin"}
+ON_SCREEN = {"record_live", "record_the_plugin", "show_the_plugin"}
 
 
 def test_there_are_examples():

@@ -7,6 +7,7 @@ from napari.layers import Image
 from tests.plugin.conftest import MILLISECONDS
 
 from napari_fiberburst import Bundle
+from napari_fiberburst.plugin.commands import show_live
 from napari_fiberburst.plugin.contributions import bundle_layers
 from napari_fiberburst.plugin.live_layer import LayerSource
 from napari_fiberburst.plugin.live_source_row import GROWING, LAYER, REPLAY, SIMULATED
@@ -175,3 +176,10 @@ def test_a_layer_hands_out_its_newest_frame_once():
     assert len(source.latest().frames) == 0
     layer.data = np.ones((2, 19, 23), np.uint16)
     assert len(layer.events.data.callbacks) == len(Image(np.zeros((19, 23))).events.data.callbacks)
+
+
+def test_a_command_opens_the_dock_at_the_live_view(live):
+    _, dock, _ = live
+    dock.choose_task(PictureTask)
+    show_live()
+    assert dock.task is dock.live

@@ -160,6 +160,16 @@ report, figure = partial(press, "report"), partial(press, "figure")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
 
 
+def show_live() -> None:
+    """Open the dock at the live view."""
+    import napari
+
+    viewer = napari.current_viewer()
+    dock = None if viewer is None else find_dock(viewer, may_open=True)
+    if dock is not None:
+        dock.choose_task(LiveTask)
+
+
 def save_film() -> None:
     """Save the layer that is selected as a film, or say why that cannot be; the dock need not be open."""
     import napari

@@ -34,6 +34,8 @@ class LiveLayers:
     ----------
     picture, mosaic : Image or None
         None before the first one.
+    shown : int
+        How many pictures have been.
     """
 
     def __init__(self, viewer: ViewerModel, like: Image | None) -> None:
@@ -48,7 +50,7 @@ class LiveLayers:
         self.picture: Image | None = None
         self.mosaic: Image | None = None
         self._limits: tuple[float, float] | None = None
-        self._count = self._refreshed = 0
+        self._count = self.shown = 0
 
     @property
     def is_removed(self) -> bool:
@@ -58,6 +60,7 @@ class LiveLayers:
     def show(self, view: "LiveView", *, in_mosaic: bool) -> None:
         """Show a picture, over the pixels of its frame, or where these lie in the mosaic."""
         data, rgb = self._as_shown(view.image)
+        self.shown += 1
         if self.picture is None:
             more: dict[str, Any] = {} if rgb else {"contrast_limits": self._fitted(data)}
             self.picture = self._added(Image(data, name="live", rgb=rgb, **more, **self._placed(data, rgb)))
@@ -132,8 +135,7 @@ class LiveLayers:
             layer.data = data
             return
         layer.data[...] = data
-        self._refreshed += 1
-        layer.refresh(thumbnail=self._refreshed % _THUMBNAIL_EVERY == 0, highlight=False, extent=False)
+        layer.refresh(thumbnail=self.shown % _THUMBNAIL_EVERY == 0, highlight=False, extent=False)
 
     def _put(self, homography: NDArray[np.float64]) -> None:
         """Move the picture to where its frame lies; what is left of a perspective is not drawn."""

@@ -67,6 +67,8 @@ class LiveTask(Task):
         What to do, in colour and in words; and how it goes.
     state : str
         "ready", "starting", "live" or "frozen".
+    rate, lag : float
+        Pictures a second that are made, and seconds from a frame to its picture.
     """
 
     needs_burst: ClassVar[bool] = False
@@ -81,7 +83,7 @@ class LiveTask(Task):
         self._jobs: list[LiveJob] = []  # none, or the one that is
         self._kept_of: LiveJob | None = None
         self._frozen: Latest | None = None
-        self._told = 0.0
+        self._told = self.rate = self.lag = 0.0
         self._drawing: tuple[float, float] | None = None  # when the last picture was begun, and given to napari
         self._layers: LiveLayers | None = None
         self._source_layer: Layer | None = None
@@ -210,6 +212,7 @@ class LiveTask(Task):
         if pasted is not None and self.mosaic.isChecked():
             layers.paste(pasted)
         self._drawing = began, time.perf_counter()
+        self.rate, self.lag = shown.rate, shown.watched.lag
         self._tell(*_LIGHTS[shown.watched.view.advice])
         if began - self._told > _SECONDS_BETWEEN_NUMBERS:
             self._told = began
