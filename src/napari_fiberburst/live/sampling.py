@@ -83,8 +83,8 @@ class CoreSampler:
         scale, offsets = (_per_channel(np.asarray(part, np.float32), channels) for part in (self._scale, self._offsets))
         values = (np.asarray(self._amplitude @ flat.astype(np.float32)) - self._of_black) * scale - offsets
         weights, glare, unreadable = self._weights, 0.0, 0.0
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
+        if not np.isfinite(values).all():
+            finite = np.isfinite(values).all(axis=1)
             unreadable = float(1 - finite.mean())
             weights, values = weights * finite, np.where(finite[:, None], values, np.float32(0))
         if not flat.max() < self._bright:  # NaN is not
