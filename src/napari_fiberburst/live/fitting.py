@@ -20,8 +20,9 @@ _FIRST, _LAST, _EVERY = 3, 3, 4
 _ROBUST = 3.0
 # Pixels: a step that moves no corner farther ends the first iterations, and the last ones.
 _NEARLY_SETTLED, _SETTLED = 0.05, 0.01
-# Nodes with less than this weight have not been seen.
-_LEAST_WEIGHT = 1e-3
+# A core that looks at nodes which have been seen with this weight counts half, because the scene is not settled there;
+# in a scene that few cores have looked at all count, because it would be held where they did.
+_ENOUGH_SEEN, _YOUNG_SEEN = 1.0, 1e-3
 # Of the unknowns: shift x and y, zoom, turn, brightness.
 _UNKNOWNS = 5
 
@@ -91,8 +92,8 @@ def _improved(
     """Return a fit after another iteration, and how alike frame and scene were before."""
     pose, nodes, brightness = fit.pose, memory.nodes, fit.brightness
     looked, normal = np.empty((4, len(shown)), np.float32), np.zeros((_UNKNOWNS, _UNKNOWNS + 1))
-    least = np.float32(_LEAST_WEIGHT * memory.growth)
-    _look(cores.x, cores.y, *nodes.under(pose), scene, memory.seen, least, weights, looked)
+    enough = np.float32((_ENOUGH_SEEN if turns else _YOUNG_SEEN) * memory.growth)
+    _look(cores.x, cores.y, *nodes.under(pose), scene, memory.seen, enough, weights, looked)
     light, weight = looked[0], looked[3]
     if not brightness:
         *_, both, power = _moments(shown, light, weight)
@@ -124,7 +125,7 @@ def _look(
     b: Any,
     scene: Floats,
     seen: Floats,
-    least: Any,
+    enough: Any,
     weights: Floats,
     looked: Floats,
 ) -> None:
@@ -149,8 +150,8 @@ def _look(
         slope_x[core] = (q - p) * above + (s - r) * below
         slope_y[core] = bottom - top
         # A sample in this cell has given weight to all four nodes.
-        is_seen = counts[first] + counts[first + step + one] > least
-        weight[core] = weights[core] if is_seen else np.float32(0)
+        seen_here = counts[first] + counts[first + step + one]
+        weight[core] = weights[core] * seen_here / (seen_here + enough)
 
 
 @compiled("void(f4[::1], f4[::1], f4, f4, f4[::1], f4[:,::1], f4, f4, f4, f8[:,::1])")

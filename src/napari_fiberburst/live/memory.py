@@ -95,6 +95,7 @@ class Memory:
         there_x, here_x = _overlap(old.column, self.nodes.column, old.columns)
         self._planes.fill(0)
         self._planes[:, here_y, here_x] = before[:, there_y, there_x]
+        self._close()
         along_y, along_x = (
             (np.arange(count) + new - start).clip(0, count - 1)
             for count, new, start in (
@@ -119,48 +120,67 @@ class Memory:
 
     def start(self, width: float) -> None:
         """Let the scene be the local mean of what was seen, over a Gaussian of so many pixels: to begin with."""
-        mass, ones = np.zeros_like(self._planes[0]), np.ones_like(self._planes[0])
-        multiply(self._planes, np.float32(0), ones, mass)
-        totals = torch.from_numpy(self._planes[BANDS:])
-        self.scene = filled_mean(totals, torch.from_numpy(mass), width / self.nodes.spacing).numpy()
+        mass, totals = torch.from_numpy(self._row_sums()), torch.from_numpy(self._planes[BANDS:])
+        self.scene = filled_mean(totals, mass, width / self.nodes.spacing).numpy()
 
     def solve(self, iterations: int) -> None:
         """Take so many steps of conjugate gradients from the scene as it stands, (C, rows, columns)."""
         solve(self._planes, np.float32(TIE * self._growth), self.scene, self._spare, iterations)
+
+    def _row_sums(self) -> Floats:
+        """Return what the matrix without its prior does to an even image of ones, (rows, columns)."""
+        sums, ones = np.zeros(self._planes.shape[1:], np.float32), np.ones(self._planes.shape[1:], np.float32)
+        multiply(self._planes, np.float32(0), ones, sums)
+        return sums
+
+    def _close(self) -> None:
+        """Cut what couples nodes to the ring, as if the scene were even there."""
+        before, planes = self._row_sums(), self._planes
+        planes[:, [0, -1]] = planes[:, :, [0, -1]] = 0
+        planes[2:BANDS, -2] = planes[[1, 3], :, -2] = planes[4, :, 1] = 0
+        planes[0] += before - self._row_sums()
+        planes[0, [0, -1]] = planes[0, :, [0, -1]] = 0
 
 
 @compiled("f8(f4[:,:,::1], f4[::1], f4[::1], f8, f8, f8, f8, f4[:,::1], f4[::1])")
 def _add(planes: Floats, x: Floats, y: Floats, u: Any, v: Any, a: Any, b: Any, values: Floats, weights: Floats) -> Any:
     """Add samples to the normal equations, and return the weight of those that lie on the nodes within the ring."""
     rows, columns = planes.shape[1:]
+    flat = planes.reshape(-1)
+    one, step, size = np.uint64(1), np.uint64(columns), np.uint64(rows * columns)  # unsigned: no negative indices
     total = 0.0
     for core in range(len(x)):
         weight = weights[core]
         across, down = u + a * x[core] - b * y[core], v + b * x[core] + a * y[core]
         if not (weight > 0 and 1 <= across < columns - 2 and 1 <= down < rows - 2):
             continue
-        i, j = int(down), int(across)
+        i, j = np.int32(down), np.int32(across)
         right, below = np.float32(across - j), np.float32(down - i)
         left, above = np.float32(1) - right, np.float32(1) - below
         p, q, r, s = left * above, right * above, left * below, right * below
         wp, wq, wr, ws = weight * p, weight * q, weight * r, weight * s
-        planes[0, i, j] += wp * p
-        planes[0, i, j + 1] += wq * q
-        planes[0, i + 1, j] += wr * r
-        planes[0, i + 1, j + 1] += ws * s
-        planes[1, i, j] += wp * q
-        planes[1, i + 1, j] += wr * s
-        planes[2, i, j] += wp * r
-        planes[2, i, j + 1] += wq * s
-        planes[3, i, j] += wp * s
-        planes[4, i, j + 1] += wq * r
+        at = np.uint64(i) * step + np.uint64(j)
+        flat[at] += wp * p
+        flat[at + one] += wq * q
+        flat[at + step] += wr * r
+        flat[at + step + one] += ws * s
+        at += size
+        flat[at] += wp * q
+        flat[at + step] += wr * s
+        at += size
+        flat[at] += wp * r
+        flat[at + one] += wq * s
+        at += size
+        flat[at] += wp * s
+        at += size
+        flat[at + one] += wq * r
         for channel in range(values.shape[1]):
+            at += size
             value = values[core, channel]
-            light = planes[BANDS + channel]
-            light[i, j] += wp * value
-            light[i, j + 1] += wq * value
-            light[i + 1, j] += wr * value
-            light[i + 1, j + 1] += ws * value
+            flat[at] += wp * value
+            flat[at + one] += wq * value
+            flat[at + step] += wr * value
+            flat[at + step + one] += ws * value
         total += weight
     return total
 

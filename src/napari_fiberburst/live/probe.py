@@ -147,7 +147,7 @@ class Probe:
     def _covered(self) -> float:
         """Return which part of the middle of the field has been looked at."""
         rows, columns = self._memory.nodes.rows, self._memory.nodes.columns
-        middle = self._memory.seen[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
+        middle = self._memory.seen[rows // 4 : 3 * rows // 4 : 2, columns // 4 : 3 * columns // 4 : 2]
         return float((middle > _SEEN * self._memory.growth).mean())
 
     def _advised(self, step: float, covered: float) -> Advice:
