@@ -22,7 +22,7 @@ _ROBUST = 3.0
 _NEARLY_SETTLED, _SETTLED = 0.05, 0.01
 # A core that looks at nodes which have been seen with this weight counts half, because the scene is not settled there;
 # in a scene that few cores have looked at all count, because it would be held where they did.
-_ENOUGH_SEEN, _YOUNG_SEEN = 1.0, 1e-3
+_ENOUGH_SEEN, _YOUNG_SEEN = 3.0, 1e-3
 # Of the unknowns: shift x and y, zoom, turn, brightness.
 _UNKNOWNS = 5
 

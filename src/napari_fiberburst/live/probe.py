@@ -20,7 +20,7 @@ from napari_fiberburst.live.sharpening import Sharpener
 from napari_fiberburst.live.view import Advice, LiveView, State
 
 # Steps of conjugate gradients for the first frame of a scene, and for each later one.
-_FIRST_STEPS, _STEPS = 30, 3
+_FIRST_STEPS, _STEPS = 30, 4
 # A frame belongs to the scene where it is this much like it. After so many frames that are not, a new one begins.
 _LEAST_ALIKE, _PATIENCE = 0.6, 2
 # Contact is lost where cores differ by less than this part of what they usually do, relative to full scale.
