@@ -2,10 +2,13 @@
 
     python -m benchmarks.live                    # 256 x 256, two seeds, two levels of noise; some minutes
     python -m benchmarks.live --side 512
+    python -m benchmarks.live --side 1024 --pitch 6.5 --seeds 1
+    python -m benchmarks.live --drift 1000       # how far places drift, and how memory grows
 
-A hand-held recording of grey frames with a pitch of 5 pixels is pushed frame by frame as fast as it goes (rate, PSNR of
-the last picture), and replayed at 30 frames a second on the machine's clock (lag, dropped frames). `reconstruct` gets
-the last 20 frames and the same bundle; PSNR is that of frame-wide pictures less a rim, after one gain and offset.
+A hand-held recording of grey frames is pushed frame by frame as fast as it goes (first picture, rate, PSNR of the last
+picture), and replayed at 30 frames a second on the machine's clock (lag, dropped frames). `reconstruct` gets the last
+20 frames and the same bundle; PyFibreBundle, where it is installed, interpolates between the cores of one frame at a
+time, with the true layout and transmission. PSNR is that of frame-wide pictures less a rim, after one gain and offset.
 """
 
 import argparse
@@ -13,8 +16,10 @@ import time
 from typing import Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
+from benchmarks.methods import PeerError, fibrebundle
 from napari_fiberburst import Bundle, Burst, LiveEngine, open_recording, reconstruct
 from napari_fiberburst.live.sources import Replay
 from napari_fiberburst.live.watching import watch
@@ -23,31 +28,46 @@ from napari_fiberburst.simulation import Camera, SimulatedRecording, simulate_re
 
 # Electrons at full scale, and noise in the dark.
 CAMERAS = {"bright": Camera(), "dim": Camera(photons=300, read_noise=0.01)}
-PITCH, STEP, RATE = 5.0, 3.0, 30.0
+STEP, RATE = 3.0, 30.0
 FRAMES, LAST = 60, 20
 # Frames that an engine takes to begin with, and pixels at the rim, that are left out.
 BEGUN, RIM = 5, 12
+# Pixels from frame to frame where drift is measured: few enough that the path stays within two fields.
+SLOW_STEP = 2.0
+COLUMNS = ["seed", "camera", "cores", "first picture", "pictures a second", "picture p95", "lag p50", "lag p95"]
+COLUMNS += ["dropped", "PSNR live", "`reconstruct`", "PyFibreBundle, one frame"]
+DRIFT_COLUMNS = ["seed", "fields", "drift at most", "after all", "memory after 100 frames", "after all"]
 
 
 def main() -> None:
     """Measure and print, a row a recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--side", type=int, default=256, help="of the frames, pixels")
+    parser.add_argument("--pitch", type=float, default=5.0, help="of the cores, pixels")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--drift", type=int, metavar="FRAMES", help="measure drift over so many frames instead")
     options = parser.parse_args()
-    print("| seed | camera | cores | pictures a second | lag p50 | lag p95 | dropped | PSNR live | `reconstruct` |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    if options.drift:
+        _head(DRIFT_COLUMNS)
+        for seed in options.seeds:
+            print(f"| {seed} | {drift(seed, options.side, options.pitch, options.drift)} |", flush=True)
+        return
+    _head(COLUMNS)
     for seed in options.seeds:
         for name, camera in CAMERAS.items():
-            print(f"| {seed} | {name} | {row(seed, camera, options.side)} |", flush=True)
+            print(f"| {seed} | {name} | {row(seed, camera, options.side, options.pitch)} |", flush=True)
 
 
-def row(seed: int, camera: Camera, side: int) -> str:
+def _head(columns: list[str]) -> None:
+    print(f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
+
+
+def row(seed: int, camera: Camera, side: int, pitch: float) -> str:
     """Return what is measured of one recording."""
     recording = simulate_recording(
-        frames=FRAMES, shape=(side, side), pitch=PITCH, path="handheld", step=STEP, camera=camera, seed=seed
+        frames=FRAMES, shape=(side, side), pitch=pitch, path="handheld", step=STEP, camera=camera, seed=seed
     )
-    bundle = Bundle.from_image(np.rint(np.clip(recording.transmission * 255, 0, 255)).astype(np.uint8))
+    bundle = bundle_of(recording)
     frames = recording.source.recorded(range(FRAMES))[..., 0]
     engine, took = LiveEngine(bundle), []
     for frame in frames:
@@ -59,14 +79,65 @@ def row(seed: int, camera: Camera, side: int) -> str:
     whole = reconstruct(Burst(frames[-LAST:]), bundle=bundle)
     cells = (
         f"{len(bundle.centres)}",
+        f"{took[0]:.2f} s",
         f"{1 / np.mean(took[BEGUN:]):.0f}",
+        f"{1000 * np.percentile(took[BEGUN:], 95):.0f} ms",
         f"{median:.0f} ms",
         f"{late:.0f} ms",
         f"{sum(one.dropped for one in watched)} of {FRAMES}",
         f"{quality(view.image, recording, FRAMES - 1):.1f} dB",
         f"{quality(whole.image, recording, FRAMES - LAST + whole.reference):.1f} dB",
+        peer(recording, frames, pitch),
     )
     return " | ".join(cells)
+
+
+def peer(recording: SimulatedRecording, frames: NDArray[Any], pitch: float) -> str:
+    """Return how fast PyFibreBundle interpolates between the cores of frames, and how good its last image is."""
+    try:
+        image, seconds = fibrebundle(
+            "live",
+            frames=frames[..., None] / np.float32(255),
+            bundle=recording.transmission,
+            centres=recording.bundle.centres,
+            pitch=pitch,
+            x=0.0,
+            y=0.0,
+            size=frames.shape[1],
+            grid=frames.shape[1],
+        )
+    except PeerError as error:
+        return str(error)
+    return f"{1 / seconds:.0f} a second, {quality(image[..., 0], recording, len(frames) - 1):.1f} dB"
+
+
+def drift(seed: int, side: int, pitch: float, count: int) -> str:
+    """Return how far places drift while a hand comes back again and again, from what they are early on."""
+    recording = simulate_recording(
+        frames=count, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
+    )
+    true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
+    engine, process = LiveEngine(bundle_of(recording)), psutil.Process()
+    off, memory = [], []
+    for number in range(count):
+        view = engine.push(recording.source.recorded([number])[0, ..., 0])
+        off.append(((view.homography - true[number]) @ middle)[:2])
+        memory.append(process.memory_info().rss / 2**20)
+    moved = np.linalg.norm(off[LAST:] - np.mean(off[LAST : 2 * LAST], axis=0), axis=1)
+    fields = 1 + np.ptp(true[:, :2, 2], axis=0) / side
+    cells = (
+        f"{fields[0]:.1f} x {fields[1]:.1f}",
+        f"{moved.max():.2f} px",
+        f"{moved[-LAST:].mean():.2f} px",
+        f"{memory[100]:.0f} MiB",
+        f"{memory[-1]:.0f} MiB",
+    )
+    return " | ".join(cells)
+
+
+def bundle_of(recording: SimulatedRecording) -> Bundle:
+    """Return the bundle as an image in even light has it."""
+    return Bundle.from_image(np.rint(np.clip(recording.transmission * 255, 0, 255)).astype(np.uint8))
 
 
 def quality(image: NDArray[np.floating[Any]], recording: SimulatedRecording, number: int) -> float:

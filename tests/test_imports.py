@@ -21,6 +21,10 @@ def test_opening_a_burst_needs_no_torch():
     assert not loaded & {"torch", "qtpy", "napari", "pydantic"}
 
 
+def test_numba_waits_for_a_live_engine_to_be_made():
+    assert "numba" not in modules_after("from napari_fiberburst import Bundle, LiveEngine, reconstruct")
+
+
 def test_every_public_name_is_there():
     for name in napari_fiberburst.__all__:
         assert getattr(napari_fiberburst, name).__doc__

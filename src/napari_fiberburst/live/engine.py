@@ -12,7 +12,6 @@ from napari_fiberburst.data.burst import MIN_SIDE
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.live.calibration import Calibration
 from napari_fiberburst.live.levels import Levels
-from napari_fiberburst.live.probe import Probe
 from napari_fiberburst.live.view import Advice, LiveView, State
 
 # Frames after which half of what was seen is forgotten.
@@ -57,6 +56,9 @@ class LiveEngine:
     ) -> None:
         if not 0 < half_life < np.inf:
             raise BurstError(f"the half-life must be a positive number of frames; got {half_life}")
+        from napari_fiberburst.live.probe import Probe  # compiles its loops, once for an installation, or loads them
+
+        self._begin = Probe
         self.bundle = bundle
         self._kept = 0.5 ** (1 / half_life)
         self._asked_levels = black_level, white_level
@@ -97,7 +99,7 @@ class LiveEngine:
             self._last = pixels
             return self._told("calibrating", "wait", pixels, seconds)
         if self._probe is None or self._probe.dtype != pixels.dtype:
-            self._probe = Probe(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
+            self._probe = self._begin(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
         self._last = pixels
         self._view = replace(self._probe.push(pixels, self._kept), seconds=seconds)
         return self._view

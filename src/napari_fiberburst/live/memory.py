@@ -1,7 +1,6 @@
 """What the cores have seen so far, as normal equations that take frames in and forget old ones.
 
-The unknown is the scene as cores see it, through their footprint: a linear spline b on nodes a pixel apart, which
-solves
+The unknown is the scene as cores see it, through their footprint: a linear spline b, which solves
 
     (S^T W S + mu P) b = S^T W v
 
@@ -12,26 +11,31 @@ Forgetting multiplies all that is there by a number below 1 with each frame. Ins
 more weight, which touches only what it adds; now and then everything is brought back to scale.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
-from torch import Tensor
 
+from napari_fiberburst.live.compiled import compiled
+from napari_fiberburst.live.cores import Cores
 from napari_fiberburst.live.nodes import Nodes
-from napari_fiberburst.operators.cg import Blocks, conjugate_gradients
+from napari_fiberburst.live.pose import Pose
+from napari_fiberburst.live.solving import BANDS, multiply, solve
 from napari_fiberburst.operators.filters import filled_mean
-from napari_fiberburst.operators.stencil import Stencil
+
+Floats = NDArray[np.float32]
 
 # mu, in samples of weight 1 to a node. It holds the scene together between samples; how smooth the picture is, is
 # decided when the footprint is undone.
 TIE = 0.03
 # Weights are brought back to scale before they have grown by this much.
 _MOST_GROWTH = 1e4
-# Nodes about the frame's pixels that are solved with them, in pitches, and those that it may move over beyond.
-_MARGIN, _SLACK = 1.0, 10
-# Planes: the five bands of the matrix, before the right-hand sides.
-_BANDS = 5
+# Nodes are as many pixels apart as is below this part of the footprint's radius: it lets no finer waves through.
+_SPACINGS, _FINEST = (2.0, 1.5, 1.0), 0.87
+# Pixels about the frame's that are solved with them, in pitches, and those that it may move over beyond.
+_MARGIN, _SLACK = 1.0, 7
 
 
 class Memory:
@@ -41,28 +45,29 @@ class Memory:
     ----------
     shape : (int, int)
         Height and width of a frame, pixels.
-    pitch : float
-        Distance of neighbouring cores, pixels.
+    pitch, radius : float
+        Distance of neighbouring cores, and radius of their footprint, pixels.
     area : float
         Pixels of a frame that show the object.
     channels : int
         Of the frames.
     """
 
-    def __init__(self, shape: tuple[int, int], pitch: float, area: float, channels: int) -> None:
+    def __init__(self, shape: tuple[int, int], pitch: float, radius: float, area: float, channels: int) -> None:
         self._margin = _MARGIN * pitch + 2
-        rows, columns = (int(next_fast_len(side + 2 * round(self._margin + _SLACK), real=True)) for side in shape)
-        self.nodes = Nodes(-((columns - shape[1]) // 2), -((rows - shape[0]) // 2), rows, columns)
-        self._neighbours = _neighbours(rows, columns)
+        spacing = next((one for one in _SPACINGS if one <= _FINEST * radius), 1.0)
+        rows, columns = (_count((side + 2 * (self._margin + _SLACK)) / spacing) for side in shape)
+        self.nodes = Nodes(0, 0, rows, columns, spacing).about(complex(shape[1] - 1, shape[0] - 1) / 2)
         self._area = area
+        self._spare = np.zeros((3, rows, columns), np.float32)
         self.clear(channels)
 
     def clear(self, channels: int) -> None:
         """Forget everything."""
-        self._growth, self._tied, self._total = 1.0, 0.0, 0.0
-        self._planes = torch.zeros(_BANDS + channels, self.nodes.rows, self.nodes.columns)
-        self.scene = torch.zeros(channels, self.nodes.rows, self.nodes.columns)
-        self._tie(1.0)
+        self._growth, self._total = 1.0, 0.0
+        self._planes = np.zeros((BANDS + channels, self.nodes.rows, self.nodes.columns), np.float32)
+        self._other_planes = np.empty_like(self._planes)  # to move them into
+        self.scene = np.zeros((channels, self.nodes.rows, self.nodes.columns), np.float32)
 
     @property
     def density(self) -> float:
@@ -70,107 +75,119 @@ class Memory:
         return self._total / self._growth
 
     @property
-    def weight(self) -> Tensor:
-        """How much each node has been seen, (rows, columns): the diagonal of the matrix without its prior."""
-        seen: Tensor = (self._planes[0] - TIE * self._tied * self._neighbours) / self._growth
+    def seen(self) -> Floats:
+        """How much each node has been seen, (rows, columns), in units of `growth`: the diagonal without the prior."""
+        seen: Floats = self._planes[0]
         return seen
+
+    @property
+    def growth(self) -> float:
+        """The weight of a sample of the newest frame."""
+        return self._growth
 
     def centre_on(self, low: complex, high: complex) -> None:
         """Move the nodes so that a frame from one corner to the other lies well inside; what falls out is forgotten."""
         if self.nodes.holds(low, high, self._margin):
             return
         old, self.nodes = self.nodes, self.nodes.about((low + high) / 2)
-        tied = self._tied
-        self._tie(-tied)
-        before, self._planes = self._planes, torch.zeros_like(self._planes)
-        there_y, here_y = _overlap(old.y0, self.nodes.y0, old.rows)
-        there_x, here_x = _overlap(old.x0, self.nodes.x0, old.columns)
+        before, self._planes, self._other_planes = self._planes, self._other_planes, self._planes
+        there_y, here_y = _overlap(old.row, self.nodes.row, old.rows)
+        there_x, here_x = _overlap(old.column, self.nodes.column, old.columns)
+        self._planes.fill(0)
         self._planes[:, here_y, here_x] = before[:, there_y, there_x]
-        # What couples to nodes that fell out must not couple to those that come in their place: these have not been
-        # seen, and the matrix would not be positive any more.
-        self._planes[2:_BANDS, -1] = 0
-        self._planes[[1, 3], :, -1] = 0
-        self._planes[4, :, 0] = 0
-        self._tie(tied)
+        self._close()
         along_y, along_x = (
-            (torch.arange(count) + new - start).clamp(0, count - 1)
-            for count, new, start in ((old.rows, self.nodes.y0, old.y0), (old.columns, self.nodes.x0, old.x0))
+            (np.arange(count) + new - start).clip(0, count - 1)
+            for count, new, start in (
+                (old.rows, self.nodes.row, old.row),
+                (old.columns, self.nodes.column, old.column),
+            )
         )
-        self.scene = self.scene[:, along_y][:, :, along_x]
+        self.scene = np.ascontiguousarray(self.scene[:, along_y[:, None], along_x])
 
     def forget(self, kept: float) -> None:
         """Keep this part, 0 to 1, of the weight of all that was seen."""
         self._growth /= kept
         if self._growth > _MOST_GROWTH:
-            self._planes /= self._growth
+            self._planes /= np.float32(self._growth)
             self._total /= self._growth
-            self._tied /= self._growth
             self._growth = 1.0
-        self._tie(self._growth - self._tied)
 
-    def add(self, points: NDArray[np.complex128], values: NDArray[np.float32], weights: NDArray[np.float32]) -> None:
-        """Take samples in: values (N, C) and weights (N,) at points (N,), x + i y in pixels of the memory."""
-        corners = self.nodes.corners(points)
-        weights = weights * corners.inside * np.float32(self._growth)
-        x, y, first = corners.x, corners.y, corners.first
-        a, b, c, d = (1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y
-        wa, wb, wc, wd = weights * a, weights * b, weights * c, weights * d
-        size, step = self.nodes.rows * self.nodes.columns, self.nodes.columns
-        right, below, below_right, below_left = (first + plane * size for plane in range(1, _BANDS))
-        index = [first, first + 1, first + step, first + step + 1, right, right + step, below, below + 1]
-        index += [below_right, below_left + 1]
-        added = [wa * a, wb * b, wc * c, wd * d, wa * b, wd * c, wa * c, wd * b, wa * d, wb * c]
-        for channel, light in enumerate(values.T):
-            start = first + (_BANDS + channel) * size
-            index += [start, start + 1, start + step, start + step + 1]
-            added += [wa * light, wb * light, wc * light, wd * light]
-        self._planes.view(-1).index_add_(
-            0, torch.from_numpy(np.concatenate(index)), torch.from_numpy(np.concatenate(added))
-        )
-        self._total += float(weights.sum()) / self._area
+    def add(self, cores: Cores, pose: Pose, values: Floats, weights: Floats) -> None:
+        """Take in what the cores of a frame that lies so show: values (N, C) and weights (N,)."""
+        weights = np.asarray(weights * np.float32(self._growth), np.float32)
+        self._total += _add(self._planes, cores.x, cores.y, *self.nodes.under(pose), values, weights) / self._area
 
     def start(self, width: float) -> None:
         """Let the scene be the local mean of what was seen, over a Gaussian of so many pixels: to begin with."""
-        mass = Stencil(self._planes[:_BANDS]).row_sums
-        self.scene = filled_mean(self._planes[_BANDS:], mass, width)
+        mass, totals = torch.from_numpy(self._row_sums()), torch.from_numpy(self._planes[BANDS:])
+        self.scene = filled_mean(totals, mass, width / self.nodes.spacing).numpy()
 
     def solve(self, iterations: int) -> None:
         """Take so many steps of conjugate gradients from the scene as it stands, (C, rows, columns)."""
-        matrix = Stencil(self._planes[:_BANDS])
-        inverse = matrix.diagonal.reciprocal()
-        (self.scene,) = conjugate_gradients(
-            lambda blocks: (matrix(blocks[0]),),
-            (self._planes[_BANDS:],),
-            lambda blocks: (inverse * blocks[0],),
-            start=(self.scene,),
-            iterations=iterations,
-            tolerance=0.0,
-            inner=_inner,
-        )
+        solve(self._planes, np.float32(TIE * self._growth), self.scene, self._spare, iterations)
 
-    def _tie(self, change: float) -> None:
-        """Give the prior this much more weight."""
-        self._planes[0].add_(self._neighbours, alpha=TIE * change)
-        self._planes[1:3] -= TIE * change
-        self._tied += change
+    def _row_sums(self) -> Floats:
+        """Return what the matrix without its prior does to an even image of ones, (rows, columns)."""
+        sums, ones = np.zeros(self._planes.shape[1:], np.float32), np.ones(self._planes.shape[1:], np.float32)
+        multiply(self._planes, np.float32(0), ones, sums)
+        return sums
+
+    def _close(self) -> None:
+        """Cut what couples nodes to the ring, as if the scene were even there."""
+        before, planes = self._row_sums(), self._planes
+        planes[:, [0, -1]] = planes[:, :, [0, -1]] = 0
+        planes[2:BANDS, -2] = planes[[1, 3], :, -2] = planes[4, :, 1] = 0
+        planes[0] += before - self._row_sums()
+        planes[0, [0, -1]] = planes[0, :, [0, -1]] = 0
 
 
-def _inner(first: Blocks, second: Blocks) -> Tensor:
-    """Return the inner product of each image (C, H, W) with its counterpart, (C, 1, 1).
+@compiled("f8(f4[:,:,::1], f4[::1], f4[::1], f8, f8, f8, f8, f4[:,::1], f4[::1])")
+def _add(planes: Floats, x: Floats, y: Floats, u: Any, v: Any, a: Any, b: Any, values: Floats, weights: Floats) -> Any:
+    """Add samples to the normal equations, and return the weight of those that lie on the nodes within the ring."""
+    rows, columns = planes.shape[1:]
+    flat = planes.reshape(-1)
+    one, step, size = np.uint64(1), np.uint64(columns), np.uint64(rows * columns)  # unsigned: no negative indices
+    total = 0.0
+    for core in range(len(x)):
+        weight = weights[core]
+        across, down = u + a * x[core] - b * y[core], v + b * x[core] + a * y[core]
+        if not (weight > 0 and 1 <= across < columns - 2 and 1 <= down < rows - 2):
+            continue
+        i, j = np.int32(down), np.int32(across)
+        right, below = np.float32(across - j), np.float32(down - i)
+        left, above = np.float32(1) - right, np.float32(1) - below
+        p, q, r, s = left * above, right * above, left * below, right * below
+        wp, wq, wr, ws = weight * p, weight * q, weight * r, weight * s
+        at = np.uint64(i) * step + np.uint64(j)
+        flat[at] += wp * p
+        flat[at + one] += wq * q
+        flat[at + step] += wr * r
+        flat[at + step + one] += ws * s
+        at += size
+        flat[at] += wp * q
+        flat[at + step] += wr * s
+        at += size
+        flat[at] += wp * r
+        flat[at + one] += wq * s
+        at += size
+        flat[at] += wp * s
+        at += size
+        flat[at + one] += wq * r
+        for channel in range(values.shape[1]):
+            at += size
+            value = values[core, channel]
+            flat[at] += wp * value
+            flat[at + one] += wq * value
+            flat[at + step] += wr * value
+            flat[at + step + one] += ws * value
+        total += weight
+    return total
 
-    In one pass, because it is taken ten times a frame; its last bits may depend on the number of threads.
-    """
-    (a,), (b,) = first, second
-    products: Tensor = torch.linalg.vecdot(a.flatten(1), b.flatten(1))
-    return products[:, None, None]
 
-
-def _neighbours(rows: int, columns: int) -> Tensor:
-    """Return how many neighbours each node has above, below and beside it, (rows, columns)."""
-    count = torch.full((rows, columns), 4.0)
-    for edge in (count[0], count[-1], count[:, 0], count[:, -1]):
-        edge -= 1
-    return count
+def _count(least: float) -> int:
+    """Return how many nodes at least, so that they and the pixels under them are quick to transform."""
+    return 2 * int(next_fast_len(int(np.ceil(least / 2)), real=True))
 
 
 def _overlap(old: int, new: int, count: int) -> tuple[slice, slice]:

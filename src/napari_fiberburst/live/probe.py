@@ -3,14 +3,15 @@
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.errors import BurstError
-from napari_fiberburst.live.following import Finder, Fit, fit
+from napari_fiberburst.live.cores import Cores
+from napari_fiberburst.live.finding import Finder
+from napari_fiberburst.live.fitting import Fit, Fitter
 from napari_fiberburst.live.levels import Levels
 from napari_fiberburst.live.memory import Memory
 from napari_fiberburst.live.pose import Pose
@@ -51,16 +52,14 @@ class Probe:
         self._bundle, self._levels = bundle, levels
         self._shape = bundle.shape
         self._sampler = CoreSampler(bundle, levels)
-        self._positions = bundle.centres[:, 0] + 1j * bundle.centres[:, 1]
+        self._cores = Cores.of(bundle.centres, self._shape)
+        self._fitter = Fitter(self._cores)
         self._finder = Finder(bundle.centres, self._shape, bundle.pitch)
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         area = float(max(1, bundle.outline.sum()))
-        self._memory = Memory(self._shape, bundle.pitch, area, channels)
+        self._memory = Memory(self._shape, bundle.pitch, bundle.radius, area, channels)
         self._sharpener = Sharpener(self._memory, bundle.radius)
-        y, x = np.indices(self._shape)
-        pixel = np.stack([x.ravel(), y.ravel()], axis=1)
-        distance = cKDTree(bundle.centres).query(pixel, distance_upper_bound=_REACH * bundle.pitch)[0]
-        self._beyond = ~np.isfinite(distance).reshape(self._shape)
+        self._ground = np.where(_near_cores(bundle), np.float32(bundle.black), np.float32(np.nan))
         self._pose = Pose.at_rest(self._shape)
         self._base = np.eye(3)
         self._spectrum: NDArray[np.complex64] | None = None
@@ -78,7 +77,7 @@ class Probe:
         contrast = float(grey[light.weights > 0].std()) if (light.weights > 0).any() else 0.0
         if light.unreadable > _MOST_UNREADABLE or contrast < max(_FAINT, 0.1 * self._usual_contrast):
             return self._missing("out of contact")
-        spectrum = self._finder.spectrum(grey)
+        spectrum = self._finder.spectrum(grey, light.weights)
         if self._spectrum is None:
             return self._begun(light, spectrum, contrast)
         found, shift = self._found(light, grey, spectrum)
@@ -103,23 +102,15 @@ class Probe:
     ) -> tuple[Fit, complex]:
         """Return how a frame lies on the scene, and how far from the one before."""
         assert self._spectrum is not None
-        shift, _ = self._finder.shift(self._spectrum, spectrum)
+        shift = self._finder.shift(self._spectrum, spectrum)
         memory = self._memory
-        scene = memory.scene.mean(dim=0).numpy()
+        scene = memory.scene[0] if len(memory.scene) == 1 else memory.scene.mean(axis=0)
         is_young = self._seen_part < _FEW_COVERED
         if is_young:
             # What lies between few cores is drawn from them, and would hold the next frame where it draws them.
-            scene = gaussian_filter(scene, _SOFT * self._bundle.pitch)
-        found = fit(
-            grey,
-            light.weights,
-            self._positions,
-            scene,
-            memory.weight.numpy(),
-            memory.nodes,
-            self._pose.moved(shift * self._pose.turn),
-            turns=not is_young,
-        )
+            scene = gaussian_filter(scene, _SOFT * self._bundle.pitch / memory.nodes.spacing)
+        start = self._pose.moved(shift * self._pose.turn)
+        found = self._fitter(grey, light.weights, scene, memory, start, turns=not is_young)
         return found, found.pose.place - self._pose.place
 
     def _begun(self, light: CoreLight, spectrum: NDArray[np.complex64], contrast: float) -> LiveView:
@@ -147,21 +138,17 @@ class Probe:
         memory.centre_on(corner, corner + complex(width - 1, height - 1))
         memory.forget(kept)
         brightness = np.float32(self._brightness)
-        points = self._pose.points(self._positions)
-        memory.add(points, light.values / brightness, light.weights * brightness**2)
+        memory.add(self._cores, self._pose, light.values / brightness, light.weights * brightness**2)
         if is_new:
             memory.start(0.5 * self._bundle.pitch)
         memory.solve(_FIRST_STEPS if is_new else _STEPS)
-        picture = self._sharpener(memory, self._pose, self._shape)
-        picture = picture * np.float32(self._brightness * self._levels.span) + np.float32(self._bundle.black)
-        picture[self._beyond] = np.nan
-        self._image = picture
+        self._image = self._sharpener(memory, self._pose, self._brightness * self._levels.span, self._ground)
 
     def _covered(self) -> float:
         """Return which part of the middle of the field has been looked at."""
         rows, columns = self._memory.nodes.rows, self._memory.nodes.columns
-        middle = self._memory.weight[rows // 4 : 3 * rows // 4, columns // 4 : 3 * columns // 4]
-        return float((middle > _SEEN).to(torch.float32).mean())
+        middle = self._memory.seen[rows // 4 : 3 * rows // 4 : 2, columns // 4 : 3 * columns // 4 : 2]
+        return float((middle > _SEEN * self._memory.growth).mean())
 
     def _advised(self, step: float, covered: float) -> Advice:
         if step > _MOST_STEP * min(self._shape):
@@ -185,3 +172,17 @@ class Probe:
             speed=speed,
             covered=covered,
         )
+
+
+def _near_cores(bundle: Bundle) -> NDArray[np.bool_]:
+    """Return the pixels that have a core within reach, (H, W)."""
+    reach, centres = _REACH * bundle.pitch, bundle.centres
+    y, x = (part.ravel() for part in np.indices(bundle.shape))
+    # Nearly all pixels are near the core that they show; to look for the others' is slow.
+    labels = bundle.labels.ravel()
+    shown = np.append(centres, [[np.inf, np.inf]], axis=0)[labels]
+    near: NDArray[np.bool_] = (shown[:, 0] - x) ** 2 + (shown[:, 1] - y) ** 2 <= reach**2
+    others = np.flatnonzero(~near)
+    pixels = np.stack([x[others], y[others]], axis=1)
+    near[others] = np.isfinite(cKDTree(centres).query(pixels, distance_upper_bound=reach)[0])
+    return near.reshape(bundle.shape)

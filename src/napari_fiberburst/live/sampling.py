@@ -15,6 +15,8 @@ from napari_fiberburst.live.levels import Levels
 _MOST_WEIGHT, _LEAST_WEIGHT = 3.0, 0.02
 # Part of its profile's power that a core may have in saturated pixels before it has no value.
 _MOST_SATURATED = 0.02
+# Pixels with less than this part of it are left out of the sums.
+_LEAST_SHARE = 5e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +67,15 @@ class CoreSampler:
         typical = np.median(power[power > 0]) if (power > 0).any() else 1.0
         weights = np.minimum(power / typical, _MOST_WEIGHT)
         self._weights = np.where(weights > _LEAST_WEIGHT, weights, 0).astype(np.float32)
-        scaled = profile[lit] / np.maximum(power, 1e-9)[labels[lit]]
-        shape = (count, labels.size)
+        share = (profile[lit] ** 2 / np.maximum(power, 1e-9)[labels[lit]]).astype(np.float32)
+        self._labels, self._share = labels, np.zeros(labels.size, np.float32)
+        self._share[lit] = share
+        lit, share = lit[share > _LEAST_SHARE], share[share > _LEAST_SHARE]
         # Pixels in the order of their cores, so that each product reads the frame nearly in order.
-        self._amplitude = csr_array((scaled.astype(np.float32), (labels[lit], lit)), shape=shape)
-        share = scaled * profile[lit]
-        self._share = csr_array((share.astype(np.float32), (labels[lit], lit)), shape=shape)
+        order = np.argsort(labels[lit], kind="stable")
+        starts = np.searchsorted(labels[lit[order]], np.arange(count + 1)).astype(np.int32)
+        entries = ((share / profile[lit])[order], lit[order].astype(np.int32), starts)
+        self._amplitude = csr_array(entries, shape=(count, labels.size))
         self._of_black = np.float32(bundle.black) * np.asarray(self._amplitude.sum(axis=1), dtype=np.float32)[:, None]
         self._scale = 1 / (np.float32(levels.span) * bundle.gains)
         self._offsets = bundle.offsets / (np.float32(levels.span) * bundle.gains)
@@ -83,13 +88,14 @@ class CoreSampler:
         scale, offsets = (_per_channel(np.asarray(part, np.float32), channels) for part in (self._scale, self._offsets))
         values = (np.asarray(self._amplitude @ flat.astype(np.float32)) - self._of_black) * scale - offsets
         weights, glare, unreadable = self._weights, 0.0, 0.0
-        finite = np.isfinite(values).all(axis=1)
-        if not finite.all():
+        if not np.isfinite(values).all():
+            finite = np.isfinite(values).all(axis=1)
             unreadable = float(1 - finite.mean())
             weights, values = weights * finite, np.where(finite[:, None], values, np.float32(0))
         if not flat.max() < self._bright:  # NaN is not
-            bright = (flat >= self._bright).any(axis=1).astype(np.float32)
-            hidden = np.asarray(self._share @ np.asarray(bright)) > _MOST_SATURATED
+            bright = np.flatnonzero((flat >= self._bright).any(axis=1) if channels > 1 else flat[:, 0] >= self._bright)
+            lost = np.bincount(self._labels[bright], self._share[bright], len(values) + 1)
+            hidden = lost[: len(values)] > _MOST_SATURATED
             glare, weights = float(hidden.mean()), weights * ~hidden
         return CoreLight(values, weights, glare, unreadable)
 
