@@ -218,3 +218,25 @@ def test_names_are_text_in_the_page(tmp_path):
     assert "&lt;b&gt;.avi" in page
     assert "a &lt; b" in page
     assert "<title>clips &amp; more</title>" in page
+
+
+def test_a_batch_that_was_killed_before_a_row_goes_on_and_fresh_begins_anew(folder, tmp_path, capsys):
+    (folder / "broken.avi").unlink()
+    output = tmp_path / "out"
+    words = ["batch", str(folder), "--task", "burst", "-o", str(output)]
+    assert main(words) == 0
+    (output / "clip 9.tif" / "row.json").unlink()
+    (output / "mine.txt").write_text("stays")
+    kept = (output / "clip 10.mkv" / "image.ome.tif").stat().st_mtime_ns
+    assert main(words) == 0
+    assert (output / "clip 9.tif" / "row.json").exists()
+    assert (output / "clip 10.mkv" / "image.ome.tif").stat().st_mtime_ns == kept
+    settings = tmp_path / "batch.toml"
+    settings.write_text("[burst]\nframes = 8\n")
+    words += ["--settings", str(settings)]
+    capsys.readouterr()
+    assert main(words) != 0
+    assert "--fresh" in capsys.readouterr().err
+    assert main([*words, "--fresh"]) == 0
+    assert (output / "clip 10.mkv" / "image.ome.tif").stat().st_mtime_ns != kept
+    assert (output / "mine.txt").read_text() == "stays"

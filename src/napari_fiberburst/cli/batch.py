@@ -35,6 +35,9 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--mp4", action="store_true", help="write a film beside each video")
     add_known(parser)
     add_frames_shown(parser)
+    parser.add_argument(
+        "--fresh", action="store_true", help="begin anew: remove what the batch has made of these recordings"
+    )
     add_workers(parser)
     parser.set_defaults(run=run, motion=None)  # what is not given is as the settings file has it
 
@@ -42,13 +45,15 @@ def add_to(commands: Any) -> None:
 def run(options: argparse.Namespace) -> int:
     """Do the task with every recording, and say what has come of it. Returns 1 where one has failed."""
     # torch takes seconds to load
-    from napari_fiberburst.recordings.batch import batching, read_settings, recordings_in
+    from napari_fiberburst.recordings.batch import batching, discard_batch, read_settings, recordings_in
     from napari_fiberburst.recordings.cluster import workers
 
     settings = read_settings(options.settings, options.task, _given(options))
     folder, output = options.folder.resolve(), options.output.resolve()
     recordings_in(folder, output)
     _make(output)
+    if options.fresh:
+        discard_batch(folder, output)
 
     def report(rows: Sequence[Row]) -> None:
         write_batch(output / "report.html", rows, f"{options.folder.resolve().name}: {options.task}")

@@ -23,7 +23,7 @@ from napari_fiberburst.io.zarr import is_zarr
 from napari_fiberburst.pipeline.reconstruct import as_bundle
 from napari_fiberburst.recordings.outputs import identity
 from napari_fiberburst.recordings.tasks import TASKS, Made, Settings
-from napari_fiberburst.recordings.work import Doing, claim, room
+from napari_fiberburst.recordings.work import Doing, claim, is_begun, remove, room
 from napari_fiberburst.results.batch import Row
 
 _ENDINGS = (*TIFF_ENDINGS, *VIDEO_ENDINGS, *ARCHIVE_ENDINGS)
@@ -168,6 +168,8 @@ def _one(
         if kept is not None:
             return kept
         with room(place.parent):
+            if _lacks_only_its_row(place):
+                remove(place)
             place.mkdir(exist_ok=True)
             made = yield from TASKS[task][0](source, place, bundle, own, client)
             row = _row(path.name, made, place, time.monotonic() - begun)
@@ -178,6 +180,24 @@ def _one(
         why = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         return Row(name=path.name, verdict="failed", notes=(why,), seconds=time.monotonic() - begun)
     return row
+
+
+def _lacks_only_its_row(place: Path) -> bool:
+    """Whether the work in a folder of the batch was done, and was killed before it had a row."""
+    return place.exists() and not (place / "row.json").exists() and not any(map(is_begun, place.glob("*.work")))
+
+
+def discard_batch(folder: Path, output: Path) -> None:
+    """Remove what a batch has made of the recordings of a folder; what else lies in its output stays.
+
+    Raises
+    ------
+    BurstError
+        There are no recordings.
+    """
+    if is_begun(output):
+        for name in (*(path.name for path in recordings_in(folder, output)), "report.html", "table.csv", "work.json"):
+            remove(output / name)
 
 
 def _row(name: str, made: Made, place: Path, seconds: float) -> Row:
