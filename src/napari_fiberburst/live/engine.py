@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,23 +26,31 @@ class LiveEngine:
     ----------
     bundle : Bundle, optional
         Of the frames. Without, the engine calibrates itself from the first twenty frames that differ, spread over a
-        second at least where their times are given.
+        second at least where their times are given, in a thread of its own, while it goes on taking frames.
     half_life : float
         Frames after which half of what was seen is forgotten.
     black_level, white_level : float, optional
         Intensities without light and at full scale; by default as `Burst` takes them from the first frame.
+    waits : bool
+        Whether the frame that completes a calibration waits for it. What comes of frames then does not depend on how
+        fast the machine is.
 
     Raises
     ------
     BurstError
         The half-life is not positive.
 
+    Notes
+    -----
+    An engine is closed by `close`, or at the end of a ``with`` block; otherwise its thread ends soon after the engine
+    is no longer used.
+
     Examples
     --------
     >>> from napari_fiberburst.simulation import simulate_recording
     >>> recording = simulate_recording(frames=24, shape=(97, 121), pitch=6.0, path="handheld", step=1.5)
-    >>> engine = LiveEngine()
-    >>> views = [engine.push(frame) for frame in recording.source.recorded(range(24))]
+    >>> with LiveEngine(waits=True) as engine:
+    ...     views = [engine.push(frame) for frame in recording.source.recorded(range(24))]
     >>> views[0].state, views[-1].state, views[-1].image.shape
     ('calibrating', 'following', (97, 121, 1))
     """
@@ -54,16 +62,29 @@ class LiveEngine:
         half_life: float = HALF_LIFE,
         black_level: float | None = None,
         white_level: float | None = None,
+        waits: bool = False,
     ) -> None:
         if not 0 < half_life < np.inf:
             raise BurstError(f"the half-life must be a positive number of frames; got {half_life}")
         self.bundle = bundle
         self._kept = 0.5 ** (1 / half_life)
         self._asked_levels = black_level, white_level
-        self._calibration = Calibration(black_level, white_level)
+        self._calibration = Calibration(black_level, white_level, waits=waits)
+        self._is_closed = False
         self._probe: Probe | None = None
         self._last: NDArray[Any] | None = None
         self._view: LiveView | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End what goes on beside the frames, and return when it has ended; the engine takes no more of them."""
+        self._is_closed = True
+        self._calibration.close()
 
     def push(self, frame: ArrayLike, seconds: float | None = None) -> LiveView:
         """Take in the newest frame and return the picture.
@@ -79,8 +100,10 @@ class LiveEngine:
         ------
         BurstError
             It is no frame, or not of the size of the ones before or of the bundle; or its time is not finite. What was
-            seen before stays, and the next frame that fits goes on.
+            seen before stays, and the next frame that fits goes on. Or the engine was closed.
         """
+        if self._is_closed:
+            raise BurstError("this live engine was closed and takes no more frames; begin a new one")
         pixels = _checked(frame)
         if seconds is not None and not math.isfinite(seconds):
             raise BurstError(f"the time of a live frame must be finite, in seconds; got {seconds}: leave it out")
@@ -103,9 +126,9 @@ class LiveEngine:
         return self._view
 
     def _told(self, state: State, advice: Advice, pixels: NDArray[Any], seconds: float | None) -> LiveView:
-        """Return the last picture, or else the frame as it came, with another state."""
+        """Return the last picture, or else the frame without its honeycomb, with another state."""
         before = self._view
-        image = pixels.astype(np.float32) if before is None else before.image
+        image = self._calibration.picture(pixels) if before is None else before.image
         return LiveView(
             image=image,
             homography=np.eye(3) if before is None else before.homography,
