@@ -13,12 +13,13 @@ from napari_fiberburst.bundle.calibrate import calibrating, with_even_gains
 from napari_fiberburst.bundle.field import find_marks
 from napari_fiberburst.bundle.noise import measure_noise
 from napari_fiberburst.bundle.pitch import find_pitch
-from napari_fiberburst.bundle.samples import in_grey, only_exposed, sample_cores
+from napari_fiberburst.bundle.samples import Samples, in_grey, only_exposed, sample_cores
 from napari_fiberburst.bundle.transmission import with_gains
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import FiberBurstError
 from napari_fiberburst.live.background import Background
 from napari_fiberburst.motion.register import refining, registering
+from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED, unexplained_part
 from napari_fiberburst.pipeline.reconstruct import iterate
 from napari_fiberburst.pipeline.remeasure import remeasured
@@ -105,10 +106,14 @@ def _calibrating(
 ) -> Generator[object, None, Bundle | None]:
     """Make a bundle of frames; None where nothing is to be seen yet, and the next ones may show more."""
     try:
-        burst = Burst(np.stack(frames), axes="TYXC"[: frames[0].ndim + 1], black_level=black, white_level=white)
-        return (yield from measuring(burst))
+        return (yield from measuring(burst_of(frames, black, white)))
     except FiberBurstError:
         return None
+
+
+def burst_of(frames: list[NDArray[Any]], black: float | None, white: float | None) -> Burst:
+    """Return frames (H, W) or (H, W, C) as a burst."""
+    return Burst(np.stack(frames), axes="TYXC"[: frames[0].ndim + 1], black_level=black, white_level=white)
 
 
 def measuring(burst: Burst) -> Generator[object, None, Bundle]:
@@ -121,17 +126,33 @@ def measuring(burst: Burst) -> Generator[object, None, Bundle]:
     grey = in_grey(torch.from_numpy(burst.frames))
     bundle = yield from calibrating(grey, burst, find_marks(only_exposed(grey)))
     samples = sample_cores(grey[..., None], bundle, burst)
-    noise = measure_noise(grey, bundle, burst, samples)
-    steps = registering(samples, dof=_DOF, bends=False, noise=0.0, iterations=_ITERATIONS, seed=0)
-    registration = yield from steps
+    registration = yield from registering(samples, dof=_DOF, bends=False, noise=0.0, iterations=_ITERATIONS, seed=0)
     if registration.is_still:
         return with_even_gains(bundle)
     bundle, registration = remeasured(bundle, registration, grey, burst)
     yield None
     samples = sample_cores(grey[..., None], bundle, burst)
     registration = yield from refining(samples, registration, dof=_DOF, iterations=_WITH_GAINS, seed=0)
-    variance = noise.of_samples(bundle, burst, samples)[samples.weights > 0] if noise is not None else torch.zeros(1)
-    if unexplained_part(registration, samples, float(variance.median()) ** 0.5) > MOST_UNEXPLAINED:
+    if not _agrees(registration, samples, bundle, burst):
         known = (yield from iterate(burst, choose("auto"))).bundle
         return bundle if known is None else known
     return with_gains(bundle, torch.from_numpy(registration.gains))
+
+
+def registered(
+    bundle: Bundle, burst: Burst, iterations: int, with_gains: int
+) -> Generator[object, None, Registration | None]:
+    """Register frames behind a bundle and find its gains, in so many iterations; None where they rest or disagree."""
+    samples = sample_cores(in_grey(torch.from_numpy(burst.frames))[..., None], bundle, burst)
+    found = yield from registering(samples, dof=_DOF, bends=False, noise=0.0, iterations=iterations, seed=0)
+    if found.is_still:
+        return None
+    found = yield from refining(samples, found, dof=_DOF, iterations=with_gains, seed=0)
+    return found if _agrees(found, samples, bundle, burst) else None
+
+
+def _agrees(registration: Registration, samples: Samples, bundle: Bundle, burst: Burst) -> bool:
+    """Whether the frames agree on a scene."""
+    noise = measure_noise(in_grey(torch.from_numpy(burst.frames)), bundle, burst, samples)
+    variance = torch.zeros(1) if noise is None else noise.of_samples(bundle, burst, samples)[samples.weights > 0]
+    return unexplained_part(registration, samples, float(variance.median()) ** 0.5) <= MOST_UNEXPLAINED

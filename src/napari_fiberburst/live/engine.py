@@ -11,12 +11,15 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import MIN_SIDE
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.live.calibration import Calibration
+from napari_fiberburst.live.improving import Improving
 from napari_fiberburst.live.levels import Levels
 from napari_fiberburst.live.probe import Probe
 from napari_fiberburst.live.view import Advice, LiveView, State
 
 # Frames after which half of what was seen is forgotten.
 HALF_LIFE = 20.0
+# Part of the weight that is left of a scene that was seen with gains that were far off.
+_KEPT_OF_OFF = 0.05
 
 
 class LiveEngine:
@@ -31,14 +34,21 @@ class LiveEngine:
         Frames after which half of what was seen is forgotten.
     black_level, white_level : float, optional
         Intensities without light and at full scale; by default as `Burst` takes them from the first frame.
+    improves : bool
+        Whether the gains of the bundle are measured on, beside the frames, as more and more of them come.
     waits : bool
-        Whether the frame that completes a calibration waits for it. What comes of frames then does not depend on how
-        fast the machine is.
+        Whether the frame that completes a calibration, or the frames for better gains, waits for it. What comes of
+        frames then does not depend on how fast the machine is.
 
     Raises
     ------
     BurstError
         The half-life is not positive.
+
+    Attributes
+    ----------
+    bundle : Bundle or None
+        As it is known by now.
 
     Notes
     -----
@@ -62,6 +72,7 @@ class LiveEngine:
         half_life: float = HALF_LIFE,
         black_level: float | None = None,
         white_level: float | None = None,
+        improves: bool = True,
         waits: bool = False,
     ) -> None:
         if not 0 < half_life < np.inf:
@@ -70,6 +81,7 @@ class LiveEngine:
         self._kept = 0.5 ** (1 / half_life)
         self._asked_levels = black_level, white_level
         self._calibration = Calibration(black_level, white_level, waits=waits)
+        self._improving = Improving(black_level, white_level, waits=waits) if improves else None
         self._is_closed = False
         self._probe: Probe | None = None
         self._last: NDArray[Any] | None = None
@@ -85,6 +97,8 @@ class LiveEngine:
         """End what goes on beside the frames, and return when it has ended; the engine takes no more of them."""
         self._is_closed = True
         self._calibration.close()
+        if self._improving is not None:
+            self._improving.close()
 
     def push(self, frame: ArrayLike, seconds: float | None = None) -> LiveView:
         """Take in the newest frame and return the picture.
@@ -123,7 +137,18 @@ class LiveEngine:
             self._probe = Probe(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
         self._last = pixels
         self._view = replace(self._probe.push(pixels, self._kept), seconds=seconds)
+        if self._view.state == "following":
+            self._improve(self._probe, pixels)
         return self._view
+
+    def _improve(self, probe: Probe, pixels: NDArray[Any]) -> None:
+        """Let the gains be measured by a frame too, and go on with better ones once there are some."""
+        if self._improving is None or self.bundle is None or not self.bundle.is_resolved:
+            return
+        found = self._improving.take(self.bundle, pixels, probe.light)
+        if found is not None and found.bundle is not self.bundle:
+            self.bundle = found.bundle
+            probe.regain(found.bundle, kept=_KEPT_OF_OFF if found.was_off else 1.0)
 
     def _told(self, state: State, advice: Advice, pixels: NDArray[Any], seconds: float | None) -> LiveView:
         """Return the last picture, or else the frame without its honeycomb, with another state."""

@@ -22,6 +22,8 @@ from napari_fiberburst.live.view import Advice, LiveView, State
 _FIRST_STEPS, _STEPS = 30, 4
 # A frame belongs to the scene where it is this much like it. After so many frames that are not, a new one begins.
 _LEAST_ALIKE, _PATIENCE = 0.6, 2
+# One that is darker than this part of the scene's light shows something else.
+_LEAST_BRIGHTNESS = 0.02
 # Contact is lost where cores differ by less than this part of what they usually do, relative to full scale.
 _LEAST_CONTRAST, _FAINT = 0.35, 1e-3
 # Part of the cores that may be saturated, or unreadable.
@@ -39,7 +41,22 @@ _MOST_TURN = 6.0
 
 
 class Probe:
-    """One bundle at one bit depth: all that is made once, and the scene."""
+    """One bundle at one bit depth: all that is made once, and the scene.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Of the frames' size.
+    pixels : numpy.ndarray
+        (H, W) or (H, W, C), the first frame.
+    levels : Levels
+        Of the frames.
+
+    Attributes
+    ----------
+    light : numpy.ndarray
+        (N,), what the cores show in the newest frame.
+    """
 
     def __init__(self, bundle: Bundle, pixels: NDArray[Any], levels: Levels) -> None:
         if bundle.shape != pixels.shape[:2]:
@@ -68,11 +85,12 @@ class Probe:
         self._missed, self._piece, self._seen_part = 0, 0, 0.0
         self._image = np.full((*self._shape, channels), np.nan, np.float32)
         self._is_grey = pixels.ndim == 2
+        self.light = np.zeros(len(bundle.centres), np.float32)
 
     def push(self, pixels: NDArray[Any], kept: float) -> LiveView:
         """Take in a frame and return the picture."""
         light = self._sampler(pixels.reshape(*self._shape, -1))
-        grey = light.grey
+        grey = self.light = light.grey
         if light.glare > _MOST_GLARE:
             return self._missing("too bright")
         contrast = float(grey[light.weights > 0].std()) if (light.weights > 0).any() else 0.0
@@ -82,7 +100,7 @@ class Probe:
         if self._spectrum is None:
             return self._begun(light, spectrum, contrast)
         found, shift = self._found(light, grey, spectrum)
-        if found.alike < _LEAST_ALIKE:
+        if found.alike < _LEAST_ALIKE or found.brightness < _LEAST_BRIGHTNESS:
             if contrast < _LEAST_CONTRAST * self._usual_contrast:
                 return self._missing("out of contact")
             self._missed += 1
@@ -97,6 +115,12 @@ class Probe:
         self._add(light, kept, is_new=is_new)
         self._seen_part = covered = self._covered()
         return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
+
+    def regain(self, bundle: Bundle, *, kept: float) -> None:
+        """Go on with other gains of the same cores, and this part of the weight of what was seen with those before."""
+        self._bundle = bundle
+        self._sampler = CoreSampler(bundle, self._levels)
+        self._memory.forget(kept)
 
     def _found(
         self, light: CoreLight, grey: NDArray[np.float32], spectrum: NDArray[np.complex64]
