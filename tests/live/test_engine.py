@@ -243,6 +243,34 @@ def test_light_that_dims_is_told_and_followed():
     assert dim.brightness == pytest.approx(0.7, abs=0.03)
 
 
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 4.0])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_exposure_that_jumps_is_followed(factor, dtype):
+    recording = recorded()
+    engine = LiveEngine(bundle_of(recording))
+    # Such light that four times as much of it, or a quarter, is within 16 bits, and the first frames within 10.
+    frames = (frames_of(recording, range(24)) * np.float32(4)).astype(dtype)
+    before = [engine.push(frame) for frame in frames[:20]]
+    after = [engine.push((frame * factor).astype(dtype)) for frame in frames[20:]]
+    assert {(view.state, view.piece) for view in (*before, *after)} == {("following", 0)}
+    levels = [np.nanmedian(views[at].image) for views, at in ((before, -1), (after, 0))]
+    assert levels[1] / levels[0] == pytest.approx(factor, rel=0.1)
+    assert quality(after[-1].image, recording.truth([23])[0]) > 26
+
+
+def test_another_bit_depth_begins_a_new_scene():
+    recording = recorded()
+    engine = LiveEngine(bundle_of(recording))
+    frames = frames_of(recording)
+    for frame in frames[:20]:
+        engine.push(frame)
+    deep = [engine.push(frame.astype(np.uint16) * 16) for frame in frames[20:]]
+    assert {(view.state, view.piece) for view in deep} == {("following", 1)}
+    assert deep[0].advice == "move a little"
+    assert np.array_equal(deep[0].homography, np.eye(3))
+    assert quality(deep[-1].image, recording.truth([39])[0]) > 28
+
+
 def test_pixels_that_are_nan_are_left_out():
     recording = recorded()
     engine = LiveEngine(bundle_of(recording))

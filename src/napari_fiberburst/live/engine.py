@@ -133,13 +133,26 @@ class LiveEngine:
         if self.bundle is None:
             self._last = pixels
             return self._told("calibrating", "wait", pixels, seconds)
-        if self._probe is None or self._probe.dtype != pixels.dtype:
-            self._probe = Probe(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
+        self._probe = probe = self._probe_for(self.bundle, pixels)
         self._last = pixels
-        self._view = replace(self._probe.push(pixels, self._kept), seconds=seconds)
+        self._view = replace(probe.push(pixels, self._kept), seconds=seconds)
         if self._view.state == "following":
-            self._improve(self._probe, pixels)
+            self._improve(probe, pixels)
         return self._view
+
+    def _probe_for(self, bundle: Bundle, pixels: NDArray[Any]) -> Probe:
+        """Return what frames like this one are seen with."""
+        before = self._probe
+        if before is None:
+            return Probe(bundle, pixels, Levels.of(pixels, *self._asked_levels))
+        if before.dtype != pixels.dtype:
+            # Levels are others, and so are frames that were kept.
+            if self._improving is not None:
+                self._improving.forget()
+            return Probe(bundle, pixels, Levels.of(pixels, *self._asked_levels), piece=before.piece + 1)
+        if self._asked_levels[1] is None:
+            before.follow_levels(pixels)
+        return before
 
     def _improve(self, probe: Probe, pixels: NDArray[Any]) -> None:
         """Let the gains be measured by a frame too, and go on with better ones once there are some."""
