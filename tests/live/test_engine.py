@@ -1,9 +1,15 @@
 """The live engine beside what simulated recordings say of themselves."""
 
 from functools import lru_cache
+from gc import collect
+from itertools import cycle
+from threading import Event
+from threading import enumerate as enumerate_threads
+from time import sleep
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from napari_fiberburst import Bundle, FiberBurstError, LiveEngine
 from napari_fiberburst.quality import match_levels, psnr
@@ -72,20 +78,105 @@ def test_colour_is_followed():
 
 def test_without_a_bundle_it_calibrates_itself():
     recording = recorded()
-    engine = LiveEngine()
-    frames = frames_of(recording)
-    first = engine.push(frames[0])
-    assert (first.state, first.advice) == ("calibrating", "wait")
-    assert np.array_equal(first.image, frames[0])
-    views = [engine.push(frame) for frame in frames[1:]]
-    assert views[-1].state == "following"
+    engine = LiveEngine(waits=True)
+    views = [engine.push(frame) for frame in frames_of(recording)]
+    assert [view.state for view in views] == ["calibrating"] * 19 + ["following"] * 21
+    assert views[0].advice == "wait"
     assert engine.bundle is not None
-    assert quality(views[-1].image, recording.truth([39])[0]) > 22
+    assert quality(views[-1].image, recording.truth([39])[0]) > 28
+
+
+def test_while_it_calibrates_the_picture_has_no_honeycomb():
+    recording = recorded()
+    frame, truth = frames_of(recording, [0])[0], recording.truth([0])[0]
+    image = LiveEngine().push(frame).image
+    assert image.dtype == np.float32
+    assert quality(image, truth) > quality(frame.astype(np.float32), truth) + 0.5
+    plain = np.add.outer(np.arange(SHAPE[0]), np.arange(SHAPE[1])).astype(np.uint16)
+    assert np.array_equal(LiveEngine().push(plain).image, plain)
+
+
+def test_the_bundle_of_a_calibration_is_near_the_one_behind_the_frames():
+    recording = recorded()
+    engine = LiveEngine(waits=True)
+    for frame in frames_of(recording, range(20)):
+        engine.push(frame)
+    found, known = engine.bundle, bundle_of(recording)
+    distance, number = cKDTree(known.centres).query(found.centres)
+    same = distance < 0.2 * known.pitch
+    assert same.mean() > 0.97
+    ratio = found.brightness[same] / known.brightness[number[same]]
+    ratio /= np.median(ratio)
+    assert 1.48 * np.median(np.abs(ratio - 1)) < 0.03
+
+
+def test_frames_go_on_while_it_calibrates(monkeypatch):
+    recording, may_end = recorded(), Event()
+    known = bundle_of(recording)
+
+    def held(burst):
+        while not may_end.is_set():
+            yield
+        return known
+
+    monkeypatch.setattr("napari_fiberburst.live.calibration.measuring", held)
+    with LiveEngine() as engine:
+        frames = cycle(frames_of(recording))
+        assert {engine.push(next(frames)).state for _ in range(60)} == {"calibrating"}
+        may_end.set()
+        while engine.push(next(frames)).state == "calibrating":
+            sleep(0.001)
+        assert engine.bundle is known
+
+
+def test_nothing_runs_once_it_is_closed(monkeypatch):
+    def endless(burst):
+        while True:
+            yield
+
+    monkeypatch.setattr("napari_fiberburst.live.calibration.measuring", endless)
+    before, frames = set(enumerate_threads()), frames_of(recorded())
+    with LiveEngine() as engine:
+        for frame in frames[:25]:
+            engine.push(frame)
+        assert set(enumerate_threads()) > before
+    assert set(enumerate_threads()) == before
+    with pytest.raises(FiberBurstError, match="this live engine was closed and takes no more frames; begin a new one"):
+        engine.push(frames[25])
+
+
+def test_an_engine_that_is_forgotten_ends_by_itself(monkeypatch):
+    ended = Event()
+
+    def endless(burst):
+        try:
+            while True:
+                yield
+        finally:
+            ended.set()
+
+    monkeypatch.setattr("napari_fiberburst.live.calibration.measuring", endless)
+    engine = LiveEngine()
+    for frame in frames_of(recorded(), range(25)):
+        engine.push(frame)
+    assert not ended.is_set()
+    del engine
+    collect()
+    assert ended.wait(60)
+
+
+def test_frames_that_show_nothing_are_calibrated_by_others_later():
+    recording = recorded()
+    engine = LiveEngine(waits=True)
+    black = [np.full(SHAPE, number % 2, np.uint8) for number in range(20)]
+    assert {engine.push(frame).state for frame in black} == {"calibrating"}
+    views = [engine.push(frame) for frame in frames_of(recording, range(20))]
+    assert views[-1].state == "following"
 
 
 def test_calibration_waits_for_a_second_where_times_are_given():
     recording = recorded()
-    engine = LiveEngine()
+    engine = LiveEngine(waits=True)
     views = [engine.push(frame, 7 + number / 30) for number, frame in enumerate(frames_of(recording))]
     assert [view.state for view in views] == ["calibrating"] * 30 + ["following"] * 10
     assert [view.seconds for view in views] == [7 + number / 30 for number in range(40)]
@@ -93,7 +184,7 @@ def test_calibration_waits_for_a_second_where_times_are_given():
 
 def test_a_clock_that_is_set_back_does_not_hold_up_calibration():
     recording = recorded()
-    engine = LiveEngine()
+    engine = LiveEngine(waits=True)
     frames = frames_of(recording)
     for frame in frames[:3]:
         engine.push(frame, 1000.0)
@@ -150,6 +241,34 @@ def test_light_that_dims_is_told_and_followed():
     dim = engine.push(0.7 * frames[10])
     assert dim.state == "following"
     assert dim.brightness == pytest.approx(0.7, abs=0.03)
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 4.0])
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_exposure_that_jumps_is_followed(factor, dtype):
+    recording = recorded()
+    engine = LiveEngine(bundle_of(recording))
+    # Such light that four times as much of it, or a quarter, is within 16 bits, and the first frames within 10.
+    frames = (frames_of(recording, range(24)) * np.float32(4)).astype(dtype)
+    before = [engine.push(frame) for frame in frames[:20]]
+    after = [engine.push((frame * factor).astype(dtype)) for frame in frames[20:]]
+    assert {(view.state, view.piece) for view in (*before, *after)} == {("following", 0)}
+    levels = [np.nanmedian(views[at].image) for views, at in ((before, -1), (after, 0))]
+    assert levels[1] / levels[0] == pytest.approx(factor, rel=0.1)
+    assert quality(after[-1].image, recording.truth([23])[0]) > 26
+
+
+def test_another_bit_depth_begins_a_new_scene():
+    recording = recorded()
+    engine = LiveEngine(bundle_of(recording))
+    frames = frames_of(recording)
+    for frame in frames[:20]:
+        engine.push(frame)
+    deep = [engine.push(frame.astype(np.uint16) * 16) for frame in frames[20:]]
+    assert {(view.state, view.piece) for view in deep} == {("following", 1)}
+    assert deep[0].advice == "move a little"
+    assert np.array_equal(deep[0].homography, np.eye(3))
+    assert quality(deep[-1].image, recording.truth([39])[0]) > 28
 
 
 def test_pixels_that_are_nan_are_left_out():

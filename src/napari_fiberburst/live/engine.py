@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,11 +11,17 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import MIN_SIDE
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.live.calibration import Calibration
+from napari_fiberburst.live.improving import Improving
 from napari_fiberburst.live.levels import Levels
 from napari_fiberburst.live.view import Advice, LiveView, State
 
+if TYPE_CHECKING:
+    from napari_fiberburst.live.probe import Probe
+
 # Frames after which half of what was seen is forgotten.
 HALF_LIFE = 20.0
+# Part of the weight that is left of a scene that was seen with gains that were far off.
+_KEPT_OF_OFF = 0.05
 
 
 class LiveEngine:
@@ -25,23 +31,38 @@ class LiveEngine:
     ----------
     bundle : Bundle, optional
         Of the frames. Without, the engine calibrates itself from the first twenty frames that differ, spread over a
-        second at least where their times are given.
+        second at least where their times are given, in a thread of its own, while it goes on taking frames.
     half_life : float
         Frames after which half of what was seen is forgotten.
     black_level, white_level : float, optional
         Intensities without light and at full scale; by default as `Burst` takes them from the first frame.
+    improves : bool
+        Whether the gains of the bundle are measured on, beside the frames, as more and more of them come.
+    waits : bool
+        Whether the frame that completes a calibration, or the frames for better gains, waits for it. What comes of
+        frames then does not depend on how fast the machine is.
 
     Raises
     ------
     BurstError
         The half-life is not positive.
 
+    Attributes
+    ----------
+    bundle : Bundle or None
+        As it is known by now.
+
+    Notes
+    -----
+    An engine is closed by `close`, or at the end of a ``with`` block; otherwise its thread ends soon after the engine
+    is no longer used.
+
     Examples
     --------
     >>> from napari_fiberburst.simulation import simulate_recording
     >>> recording = simulate_recording(frames=24, shape=(97, 121), pitch=6.0, path="handheld", step=1.5)
-    >>> engine = LiveEngine()
-    >>> views = [engine.push(frame) for frame in recording.source.recorded(range(24))]
+    >>> with LiveEngine(waits=True) as engine:
+    ...     views = [engine.push(frame) for frame in recording.source.recorded(range(24))]
     >>> views[0].state, views[-1].state, views[-1].image.shape
     ('calibrating', 'following', (97, 121, 1))
     """
@@ -53,6 +74,8 @@ class LiveEngine:
         half_life: float = HALF_LIFE,
         black_level: float | None = None,
         white_level: float | None = None,
+        improves: bool = True,
+        waits: bool = False,
     ) -> None:
         if not 0 < half_life < np.inf:
             raise BurstError(f"the half-life must be a positive number of frames; got {half_life}")
@@ -62,10 +85,25 @@ class LiveEngine:
         self.bundle = bundle
         self._kept = 0.5 ** (1 / half_life)
         self._asked_levels = black_level, white_level
-        self._calibration = Calibration(black_level, white_level)
+        self._calibration = Calibration(black_level, white_level, waits=waits)
+        self._improving = Improving(black_level, white_level, waits=waits) if improves else None
+        self._is_closed = False
         self._probe: Probe | None = None
         self._last: NDArray[Any] | None = None
         self._view: LiveView | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End what goes on beside the frames, and return when it has ended; the engine takes no more of them."""
+        self._is_closed = True
+        self._calibration.close()
+        if self._improving is not None:
+            self._improving.close()
 
     def push(self, frame: ArrayLike, seconds: float | None = None) -> LiveView:
         """Take in the newest frame and return the picture.
@@ -81,8 +119,10 @@ class LiveEngine:
         ------
         BurstError
             It is no frame, or not of the size of the ones before or of the bundle; or its time is not finite. What was
-            seen before stays, and the next frame that fits goes on.
+            seen before stays, and the next frame that fits goes on. Or the engine was closed.
         """
+        if self._is_closed:
+            raise BurstError("this live engine was closed and takes no more frames; begin a new one")
         pixels = _checked(frame)
         if seconds is not None and not math.isfinite(seconds):
             raise BurstError(f"the time of a live frame must be finite, in seconds; got {seconds}: leave it out")
@@ -98,16 +138,40 @@ class LiveEngine:
         if self.bundle is None:
             self._last = pixels
             return self._told("calibrating", "wait", pixels, seconds)
-        if self._probe is None or self._probe.dtype != pixels.dtype:
-            self._probe = self._begin(self.bundle, pixels, Levels.of(pixels, *self._asked_levels))
+        self._probe = probe = self._probe_for(self.bundle, pixels)
         self._last = pixels
-        self._view = replace(self._probe.push(pixels, self._kept), seconds=seconds)
+        self._view = replace(probe.push(pixels, self._kept), seconds=seconds)
+        if self._view.state == "following":
+            self._improve(probe, pixels)
         return self._view
 
+    def _probe_for(self, bundle: Bundle, pixels: NDArray[Any]) -> "Probe":
+        """Return what frames like this one are seen with."""
+        before = self._probe
+        if before is None:
+            return self._begin(bundle, pixels, Levels.of(pixels, *self._asked_levels))
+        if before.dtype != pixels.dtype:
+            # Levels are others, and so are frames that were kept.
+            if self._improving is not None:
+                self._improving.forget()
+            return self._begin(bundle, pixels, Levels.of(pixels, *self._asked_levels), piece=before.piece + 1)
+        if self._asked_levels[1] is None:
+            before.follow_levels(pixels)
+        return before
+
+    def _improve(self, probe: "Probe", pixels: NDArray[Any]) -> None:
+        """Let the gains be measured by a frame too, and go on with better ones once there are some."""
+        if self._improving is None or self.bundle is None or not self.bundle.is_resolved:
+            return
+        found = self._improving.take(self.bundle, pixels, probe.light)
+        if found is not None and found.bundle is not self.bundle:
+            self.bundle = found.bundle
+            probe.regain(found.bundle, kept=_KEPT_OF_OFF if found.was_off else 1.0)
+
     def _told(self, state: State, advice: Advice, pixels: NDArray[Any], seconds: float | None) -> LiveView:
-        """Return the last picture, or else the frame as it came, with another state."""
+        """Return the last picture, or else the frame without its honeycomb, with another state."""
         before = self._view
-        image = pixels.astype(np.float32) if before is None else before.image
+        image = self._calibration.picture(pixels) if before is None else before.image
         return LiveView(
             image=image,
             homography=np.eye(3) if before is None else before.homography,

@@ -23,6 +23,8 @@ from napari_fiberburst.live.view import Advice, LiveView, State
 _FIRST_STEPS, _STEPS = 30, 4
 # A frame belongs to the scene where it is this much like it. After so many frames that are not, a new one begins.
 _LEAST_ALIKE, _PATIENCE = 0.6, 2
+# One that is darker than this part of the scene's light shows something else.
+_LEAST_BRIGHTNESS = 0.02
 # Contact is lost where cores differ by less than this part of what they usually do, relative to full scale.
 _LEAST_CONTRAST, _FAINT = 0.35, 1e-3
 # Part of the cores that may be saturated, or unreadable.
@@ -40,9 +42,28 @@ _MOST_TURN = 6.0
 
 
 class Probe:
-    """One bundle at one bit depth: all that is made once, and the scene."""
+    """One bundle at one bit depth: all that is made once, and the scene.
 
-    def __init__(self, bundle: Bundle, pixels: NDArray[Any], levels: Levels) -> None:
+    Parameters
+    ----------
+    bundle : Bundle
+        Of the frames' size.
+    pixels : numpy.ndarray
+        (H, W) or (H, W, C), the first frame.
+    levels : Levels
+        Of the frames.
+    piece : int
+        How many scenes there were before.
+
+    Attributes
+    ----------
+    piece : int
+        How many times the scene was begun anew.
+    light : numpy.ndarray
+        (N,), what the cores show in the newest frame.
+    """
+
+    def __init__(self, bundle: Bundle, pixels: NDArray[Any], levels: Levels, piece: int = 0) -> None:
         if bundle.shape != pixels.shape[:2]:
             raise BurstError(
                 f"the bundle was measured in frames of {bundle.shape[0]} x {bundle.shape[1]} pixels, and the camera "
@@ -64,14 +85,15 @@ class Probe:
         self._base = np.eye(3)
         self._spectrum: NDArray[np.complex64] | None = None
         self._usual_contrast, self._brightness = 0.0, 1.0
-        self._missed, self._piece, self._seen_part = 0, 0, 0.0
+        self._missed, self.piece, self._seen_part = 0, piece, 0.0
         self._image = np.full((*self._shape, channels), np.nan, np.float32)
         self._is_grey = pixels.ndim == 2
+        self.light = np.zeros(len(bundle.centres), np.float32)
 
     def push(self, pixels: NDArray[Any], kept: float) -> LiveView:
         """Take in a frame and return the picture."""
         light = self._sampler(pixels.reshape(*self._shape, -1))
-        grey = light.grey
+        grey = self.light = light.grey
         if light.glare > _MOST_GLARE:
             return self._missing("too bright")
         contrast = float(grey[light.weights > 0].std()) if (light.weights > 0).any() else 0.0
@@ -81,13 +103,13 @@ class Probe:
         if self._spectrum is None:
             return self._begun(light, spectrum, contrast)
         found, shift = self._found(light, grey, spectrum)
-        if found.alike < _LEAST_ALIKE:
+        if found.alike < _LEAST_ALIKE or found.brightness < _LEAST_BRIGHTNESS:
             if contrast < _LEAST_CONTRAST * self._usual_contrast:
                 return self._missing("out of contact")
             self._missed += 1
             if self._missed < _PATIENCE:
                 return self._view("lost", "too fast", found.alike)
-            self._piece += 1
+            self.piece += 1
             return self._begun(light, spectrum, contrast)
         is_new = self._base_on(found.pose, light)
         self._missed, self._spectrum = 0, spectrum
@@ -96,6 +118,27 @@ class Probe:
         self._add(light, kept, is_new=is_new)
         self._seen_part = covered = self._covered()
         return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
+
+    def follow_levels(self, pixels: NDArray[Any]) -> None:
+        """Raise the white level where a frame is above it: the first ones may have been dim."""
+        highest = float(pixels.max())
+        if not highest > self._levels.white:
+            return
+        before = self._levels
+        # Floats do not tell full scale, so there is room for the next ones.
+        white = 2 * highest if pixels.dtype.kind == "f" else Levels.of(pixels, before.black, None).white
+        self._levels = Levels(before.black, white)
+        self._sampler = CoreSampler(self._bundle, self._levels)
+        # All that is known is in parts of full scale.
+        scale = before.span / self._levels.span
+        self._brightness *= scale
+        self._usual_contrast *= scale
+
+    def regain(self, bundle: Bundle, *, kept: float) -> None:
+        """Go on with other gains of the same cores, and this part of the weight of what was seen with those before."""
+        self._bundle = bundle
+        self._sampler = CoreSampler(bundle, self._levels)
+        self._memory.forget(kept)
 
     def _found(
         self, light: CoreLight, grey: NDArray[np.float32], spectrum: NDArray[np.complex64]
@@ -166,7 +209,7 @@ class Probe:
             homography=self._base @ self._pose.matrix,
             state=state,
             advice=advice,
-            piece=self._piece,
+            piece=self.piece,
             alike=alike,
             brightness=self._brightness,
             speed=speed,

@@ -18,7 +18,8 @@ class LiveView:
     ----------
     image : numpy.ndarray
         (H, W) or (H, W, C) float32 in the camera's intensities, over the pixels of the newest frame that could be
-        placed; NaN beyond the bundle. While the engine calibrates itself, the frame as it came.
+        placed; NaN beyond the bundle. While the engine calibrates itself, the newest frame, blurred so that it shows no
+        honeycomb.
     homography : numpy.ndarray
         (3, 3) float64: pixel (x, y) of that frame to pixel of the first one; of the first one since contact was found
         elsewhere, or the recording was cut.
