@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 1100, 720
 SHOWN_WIDTH = 760
 MILLISECONDS_A_FRAME, MILLISECONDS_AT_END = 250, 3000
 RAW, SHARPENING = 5, 22
-COLOURS = 64
+COLOURS = 128
 
 
 def wait(until: Callable[[], bool], seconds: float) -> None:
@@ -38,7 +38,7 @@ def main(path: str) -> None:
     def take() -> None:
         shown = Image.fromarray(viewer.window.screenshot(canvas_only=False, flash=False)).convert("RGB")
         small = shown.resize((SHOWN_WIDTH, round(SHOWN_WIDTH * shown.height / shown.width)), Image.Resampling.LANCZOS)
-        frames.append(small.quantize(COLOURS, dither=Image.Dither.NONE))
+        frames.append(small.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
 
     def take_some(count: int) -> None:
         for _ in range(count):

@@ -2,6 +2,8 @@
 
 They are compiled for the types that are named, when the module that has them is imported, and kept on disk: that takes
 some seconds once for each installation, and nothing while frames come in. `LiveEngine` imports them, when it is made.
+Where nothing can be kept, because neither the package's folder nor the user's cache can be written, they are compiled
+at every start.
 """
 
 from collections.abc import Callable
@@ -16,5 +18,18 @@ _FREEDOMS = {"reassoc", "contract", "nsz", "arcp"}
 
 def compiled(*signatures: str) -> Callable[[_Function], _Function]:
     """Compile a function for numba's signatures, such as "void(f4[:,::1], i8)"."""
-    decorate = numba.njit(list(signatures), cache=True, nogil=True, fastmath=_FREEDOMS, error_model="numpy")
-    return cast(Callable[[_Function], _Function], decorate)
+
+    def decorate(function: _Function) -> _Function:
+        try:
+            made = _compile(function, signatures, is_kept=True)
+        except RuntimeError as error:
+            if "no locator" not in str(error):
+                raise
+            made = _compile(function, signatures, is_kept=False)
+        return cast(_Function, made)
+
+    return decorate
+
+
+def _compile(function: _Function, signatures: tuple[str, ...], *, is_kept: bool) -> Any:
+    return numba.njit(list(signatures), cache=is_kept, nogil=True, fastmath=_FREEDOMS, error_model="numpy")(function)

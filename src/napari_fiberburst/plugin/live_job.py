@@ -17,6 +17,7 @@ from napari_fiberburst.plugin.drivers import without_clash
 from napari_fiberburst.streaming import Latest as Mailbox
 
 if TYPE_CHECKING:
+    from napari_fiberburst.live.engine import LiveEngine
     from napari_fiberburst.live.mosaic import LiveMosaic
     from napari_fiberburst.live.watching import Watched
 
@@ -135,12 +136,15 @@ class LiveJob:
 
     def _watch(self) -> None:
         from napari_fiberburst.live.engine import LiveEngine  # torch takes seconds to load
-        from napari_fiberburst.live.mosaic import LiveMosaic
-        from napari_fiberburst.live.watching import watch
         from napari_fiberburst.pipeline.reconstruct import as_bundle
 
-        engine = LiveEngine(None if self._bundle is None else as_bundle(self._bundle))
-        source = self._open()
+        with LiveEngine(None if self._bundle is None else as_bundle(self._bundle)) as engine:
+            self._show_all(self._open(), engine)
+
+    def _show_all(self, source: LiveSource, engine: "LiveEngine") -> None:
+        from napari_fiberburst.live.mosaic import LiveMosaic
+        from napari_fiberburst.live.watching import watch
+
         with self._lock:
             self._source, self._ring = source, Ring(source.clock, self._seconds)
             if self._stopped.is_set():

@@ -290,7 +290,7 @@ class LiveTask(Task):
         self.light.setText("●")
         self.light.setAccessibleName("traffic light")
         font = self.light.font()
-        font.setPointSize(2 * font.pointSize())
+        font.setPointSize(3 * font.pointSize())
         self.light.setFont(font)
         for label in (self.words, self.numbers):
             label.setWordWrap(True)
@@ -317,7 +317,7 @@ def _in_numbers(shown: Shown) -> str:
     if watched.view.covered:
         parts.append(f"{100 * watched.view.covered:.0f} % seen")
     if shown.skipped:
-        parts.append(f"{shown.skipped:,} frames passed over")
+        parts.append(f"{shown.skipped:,} frame{'s' if shown.skipped > 1 else ''} passed over")
     if shown.lost:
         parts.append(f"{shown.lost:,} lost by the source")
     return "; ".join(parts)
