@@ -11,6 +11,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import MIN_SIDE
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.live.calibration import Calibration
+from napari_fiberburst.live.honeycomb import Honeycomb
 from napari_fiberburst.live.improving import Improving
 from napari_fiberburst.live.levels import Levels
 from napari_fiberburst.live.view import Advice, LiveView, State
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 # Frames after which half of what was seen is forgotten.
 HALF_LIFE = 20.0
-# Part of the weight that is left of a scene that was seen with gains that were far off.
-_KEPT_OF_OFF = 0.05
+# Part of the weight that is left of a scene that was seen with gains that were far off, or beside the cores.
+_KEPT = 0.05
 
 
 class LiveEngine:
@@ -90,6 +91,7 @@ class LiveEngine:
         self._is_closed = False
         self._probe: Probe | None = None
         self._last: NDArray[Any] | None = None
+        self._honeycomb: Honeycomb | None = None
         self._view: LiveView | None = None
 
     def __enter__(self) -> Self:
@@ -140,10 +142,11 @@ class LiveEngine:
             return self._told("calibrating", "wait", pixels, seconds)
         self._probe = probe = self._probe_for(self.bundle, pixels)
         self._last = pixels
-        self._view = replace(probe.push(pixels, self._kept), seconds=seconds)
-        if self._view.state == "following":
+        view = self._with_bundle_watched(probe, pixels, replace(probe.push(pixels, self._kept), seconds=seconds))
+        self._view = view
+        if view.state == "following":
             self._improve(probe, pixels)
-        return self._view
+        return view
 
     def _probe_for(self, bundle: Bundle, pixels: NDArray[Any]) -> "Probe":
         """Return what frames like this one are seen with."""
@@ -159,6 +162,26 @@ class LiveEngine:
             before.follow_levels(pixels)
         return before
 
+    def _with_bundle_watched(self, probe: "Probe", pixels: NDArray[Any], view: LiveView) -> LiveView:
+        """Return a view that tells where frames show another bundle, and follow this one where it has moved."""
+        if self.bundle is None or not self.bundle.is_resolved or view.advice in ("out of contact", "too bright"):
+            return view
+        if self._honeycomb is None:
+            self._honeycomb = Honeycomb(self.bundle)
+        seen = self._honeycomb.watch(pixels, probe.light, is_placed=view.state == "following")
+        if seen == "another":
+            return replace(view, state="lost", advice="another bundle")
+        if seen != "moved":
+            return view
+        x, y = self._honeycomb.shift
+        self.bundle = self.bundle.moved(np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]]))
+        probe.see_through(self.bundle)
+        probe.forget(_KEPT)
+        self._honeycomb = None
+        if self._improving is not None:
+            self._improving.forget()
+        return replace(view, advice="the bundle has moved")
+
     def _improve(self, probe: "Probe", pixels: NDArray[Any]) -> None:
         """Let the gains be measured by a frame too, and go on with better ones once there are some."""
         if self._improving is None or self.bundle is None or not self.bundle.is_resolved:
@@ -166,7 +189,9 @@ class LiveEngine:
         found = self._improving.take(self.bundle, pixels, probe.light)
         if found is not None and found.bundle is not self.bundle:
             self.bundle = found.bundle
-            probe.regain(found.bundle, kept=_KEPT_OF_OFF if found.was_off else 1.0)
+            probe.see_through(found.bundle)
+            if found.was_off:
+                probe.forget(_KEPT)
 
     def _told(self, state: State, advice: Advice, pixels: NDArray[Any], seconds: float | None) -> LiveView:
         """Return the last picture, or else the frame without its honeycomb, with another state."""

@@ -70,17 +70,13 @@ class Probe:
                 f"gives {pixels.shape[0]} x {pixels.shape[1]}; set it as for the bundle, or leave the bundle out"
             )
         self.dtype = pixels.dtype
-        self._bundle, self._levels = bundle, levels
+        self._levels = levels
         self._shape = bundle.shape
-        self._sampler = CoreSampler(bundle, levels)
-        self._cores = Cores.of(bundle.centres, self._shape)
-        self._fitter = Fitter(self._cores)
-        self._finder = Finder(bundle.centres, self._shape, bundle.pitch)
+        self.see_through(bundle)
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         area = float(max(1, bundle.outline.sum()))
         self._memory = Memory(self._shape, bundle.pitch, bundle.radius, area, channels)
         self._sharpener = Sharpener(self._memory, bundle.radius)
-        self._ground = np.where(_near_cores(bundle), np.float32(bundle.black), np.float32(np.nan))
         self._pose = Pose.at_rest(self._shape)
         self._base = np.eye(3)
         self._spectrum: NDArray[np.complex64] | None = None
@@ -89,6 +85,15 @@ class Probe:
         self._image = np.full((*self._shape, channels), np.nan, np.float32)
         self._is_grey = pixels.ndim == 2
         self.light = np.zeros(len(bundle.centres), np.float32)
+
+    def see_through(self, bundle: Bundle) -> None:
+        """Take the places of the cores, and all else that frames are seen by, from a bundle."""
+        self._bundle = bundle
+        self._sampler = CoreSampler(bundle, self._levels)
+        self._cores = Cores.of(bundle.centres, self._shape)
+        self._fitter = Fitter(self._cores)
+        self._finder = Finder(bundle.centres, self._shape, bundle.pitch)
+        self._ground = np.where(_near_cores(bundle), np.float32(bundle.black), np.float32(np.nan))
 
     def push(self, pixels: NDArray[Any], kept: float) -> LiveView:
         """Take in a frame and return the picture."""
@@ -134,10 +139,8 @@ class Probe:
         self._brightness *= scale
         self._usual_contrast *= scale
 
-    def regain(self, bundle: Bundle, *, kept: float) -> None:
-        """Go on with other gains of the same cores, and this part of the weight of what was seen with those before."""
-        self._bundle = bundle
-        self._sampler = CoreSampler(bundle, self._levels)
+    def forget(self, kept: float) -> None:
+        """Keep this part of the weight of what was seen: it was seen by what has turned out to be wrong."""
         self._memory.forget(kept)
 
     def _found(

@@ -7,7 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 State = Literal["calibrating", "following", "lost", "frozen"]
-Advice = Literal["fine", "wait", "move a little", "too fast", "out of contact", "too bright", "the camera has stopped"]
+Advice = Literal[
+    "fine",
+    "wait",
+    "move a little",
+    "too fast",
+    "out of contact",
+    "too bright",
+    "another bundle",
+    "the bundle has moved",
+    "the camera has stopped",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -44,6 +44,8 @@ _LIGHTS = {
     "too fast": (_RED, "Too fast: move slower"),
     "out of contact": (_RED, "Out of contact: touch the object, or focus"),
     "too bright": (_RED, "Too bright: lower the light or the exposure"),
+    "another bundle": (_RED, "These frames show another bundle: choose its own, or none"),
+    "the bundle has moved": (_YELLOW, "The bundle has moved on the camera, and is followed"),
     "the camera has stopped": (_RED, "The camera has stopped: all frames are alike"),
 }
 
