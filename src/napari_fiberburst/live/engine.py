@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # Frames after which half of what was seen is forgotten.
 HALF_LIFE = 20.0
-# Part of the weight that is left of a scene that was seen with gains that were far off, or beside the cores.
+# Part of the weight that is left of a scene that was seen with gains that were far off.
 _KEPT = 0.05
 
 
@@ -176,7 +176,8 @@ class LiveEngine:
         x, y = self._honeycomb.shift
         self.bundle = self.bundle.moved(np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]]))
         probe.see_through(self.bundle)
-        probe.forget(_KEPT)
+        # What was seen beside the cores would hold the next frames where the bundle was.
+        probe.begin_anew()
         self._honeycomb = None
         if self._improving is not None:
             self._improving.forget()

@@ -139,6 +139,11 @@ class Probe:
         self._brightness *= scale
         self._usual_contrast *= scale
 
+    def begin_anew(self) -> None:
+        """Begin a new scene with the next frame."""
+        self._spectrum = None
+        self.piece += 1
+
     def forget(self, kept: float) -> None:
         """Keep this part of the weight of what was seen: it was seen by what has turned out to be wrong."""
         self._memory.forget(kept)
