@@ -61,13 +61,13 @@ def run(options: argparse.Namespace) -> int:
         )
     bundle = None if options.bundle is None else as_bundle(options.bundle)
     known = recording.acquisition
-    engine = LiveEngine(bundle, black_level=known.black_level, white_level=known.white_level)
-    if target is None:
-        _tell(list(map(_without_picture, watch(source, engine))), source.rate)
-        return 0
-    with _Film.about(recording, target, source.rate) as film:
-        _tell(list(map(film.show, watch(source, engine))), source.rate)
-        film.write()
+    with LiveEngine(bundle, black_level=known.black_level, white_level=known.white_level) as engine:
+        if target is None:
+            _tell(list(map(_without_picture, watch(source, engine))), source.rate)
+            return 0
+        with _Film.about(recording, target, source.rate) as film:
+            _tell(list(map(film.show, watch(source, engine))), source.rate)
+            film.write()
     print(f"wrote {target}")
     return 0
 
