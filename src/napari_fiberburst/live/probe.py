@@ -17,6 +17,7 @@ from napari_fiberburst.live.memory import Memory
 from napari_fiberburst.live.pose import Pose
 from napari_fiberburst.live.sampling import CoreLight, CoreSampler
 from napari_fiberburst.live.sharpening import Sharpener
+from napari_fiberburst.live.smear import Smear
 from napari_fiberburst.live.view import Advice, LiveView, State
 
 # Steps of conjugate gradients for the first frame of a scene, and for each later one.
@@ -79,6 +80,7 @@ class Probe:
         self._sharpener = Sharpener(self._memory, bundle.radius)
         self._pose = Pose.at_rest(self._shape)
         self._base = np.eye(3)
+        self._smear = Smear(bundle.pitch)
         self._spectrum: NDArray[np.complex64] | None = None
         self._usual_contrast, self._brightness = 0.0, 1.0
         self._missed, self.piece, self._seen_part = 0, piece, 0.0
@@ -108,7 +110,7 @@ class Probe:
         if self._spectrum is None:
             return self._begun(light, spectrum, contrast)
         found, shift = self._found(light, grey, spectrum)
-        if found.alike < _LEAST_ALIKE or found.brightness < _LEAST_BRIGHTNESS:
+        if not (found.alike >= _LEAST_ALIKE and found.brightness >= _LEAST_BRIGHTNESS):  # NaN is not
             if contrast < _LEAST_CONTRAST * self._usual_contrast:
                 return self._missing("out of contact")
             self._missed += 1
@@ -116,6 +118,15 @@ class Probe:
                 return self._view("lost", "too fast", found.alike)
             self.piece += 1
             return self._begun(light, spectrum, contrast)
+        self._smear.take(
+            found.pose.place - self._pose.place,
+            found.pose.points(self._positions),
+            grey / np.float32(found.brightness),
+            light.weights,
+            self._memory.nodes,
+            self._memory.scene.mean(dim=0).numpy(),
+            self._memory.weight.numpy(),
+        )
         is_new = self._base_on(found.pose, light)
         self._missed, self._spectrum = 0, spectrum
         self._usual_contrast += 0.1 * (contrast - self._usual_contrast)
@@ -169,6 +180,7 @@ class Probe:
         self._memory.clear(light.values.shape[1])
         self._pose, self._base = Pose.at_rest(self._shape), np.eye(3)
         self._missed, self._spectrum, self._brightness = 0, spectrum, 1.0
+        self._smear = Smear(self._bundle.pitch)
         self._usual_contrast, self._seen_part = contrast, 0.0
         self._add(light, 1.0, is_new=True)
         return self._view("following", "move a little", 1.0, 0.0, self._covered())
@@ -204,6 +216,8 @@ class Probe:
     def _advised(self, step: float, covered: float) -> Advice:
         if step > _MOST_STEP * min(self._shape):
             return "too fast"
+        if self._smear.is_told:
+            return "hold still"
         return "fine" if covered > _ENOUGH_COVERED else "move a little"
 
     def _missing(self, advice: Advice) -> LiveView:

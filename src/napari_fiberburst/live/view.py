@@ -11,6 +11,7 @@ Advice = Literal[
     "fine",
     "wait",
     "move a little",
+    "hold still",
     "too fast",
     "out of contact",
     "too bright",
