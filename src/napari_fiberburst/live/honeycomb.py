@@ -72,7 +72,8 @@ class Honeycomb:
             Whether the frame could be placed.
         """
         self._passed += 1
-        is_well = is_placed and self._told in ("this", "unclear") and self._count >= _LEAST_FRAMES
+        is_known = self._told == "this" or (self._told == "unclear" and self._count >= _LEAST_FRAMES)
+        is_well = is_placed and is_known
         if light.mean() < _LEAST_MEAN or (is_well and self._passed < _EVERY):
             return self._told
         self._passed = 0

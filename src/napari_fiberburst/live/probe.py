@@ -120,12 +120,12 @@ class Probe:
             return self._begun(light, spectrum, contrast)
         self._smear.take(
             found.pose.place - self._pose.place,
-            found.pose.points(self._positions),
+            self._cores,
+            found.pose,
             grey / np.float32(found.brightness),
             light.weights,
-            self._memory.nodes,
-            self._memory.scene.mean(dim=0).numpy(),
-            self._memory.weight.numpy(),
+            self._scene(),
+            self._memory,
         )
         is_new = self._base_on(found.pose, light)
         self._missed, self._spectrum = 0, spectrum
@@ -166,7 +166,7 @@ class Probe:
         assert self._spectrum is not None
         shift = self._finder.shift(self._spectrum, spectrum)
         memory = self._memory
-        scene = memory.scene[0] if len(memory.scene) == 1 else memory.scene.mean(axis=0)
+        scene = self._scene()
         is_young = self._seen_part < _FEW_COVERED
         if is_young:
             # What lies between few cores is drawn from them, and would hold the next frame where it draws them.
@@ -174,6 +174,12 @@ class Probe:
         start = self._pose.moved(shift * self._pose.turn)
         found = self._fitter(grey, light.weights, scene, memory, start, turns=not is_young)
         return found, found.pose.place - self._pose.place
+
+    def _scene(self) -> NDArray[np.float32]:
+        """Return the mean of the scene's channels, (rows, columns)."""
+        scene = self._memory.scene
+        grey: NDArray[np.float32] = scene[0] if len(scene) == 1 else scene.mean(axis=0)
+        return grey
 
     def _begun(self, light: CoreLight, spectrum: NDArray[np.complex64], contrast: float) -> LiveView:
         """Begin a new scene with a frame."""

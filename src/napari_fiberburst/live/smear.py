@@ -7,11 +7,15 @@ the scene, and frames that do not quite fit it, make that factor large too, but 
 """
 
 from statistics import median
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_fiberburst.live.nodes import Nodes
+from napari_fiberburst.live.compiled import compiled
+from napari_fiberburst.live.cores import Cores
+from napari_fiberburst.live.memory import Memory
+from napari_fiberburst.live.pose import Pose
 
 Floats = NDArray[np.float32]
 
@@ -45,14 +49,7 @@ class Smear:
         return len(self._squares) == _FRAMES and median(self._squares) > _LEAST_LENGTH**2
 
     def take(
-        self,
-        step: complex,
-        points: NDArray[np.complex128],
-        values: Floats,
-        weights: Floats,
-        nodes: Nodes,
-        scene: Floats,
-        seen: Floats,
+        self, step: complex, cores: Cores, pose: Pose, values: Floats, weights: Floats, scene: Floats, memory: Memory
     ) -> None:
         """Take in a frame.
 
@@ -60,36 +57,86 @@ class Smear:
         ----------
         step : complex
             From the frame before, x + i y in pixels of the scene.
-        points, values, weights : numpy.ndarray
-            (N,), where its cores look, and what they show at the brightness of the scene.
-        nodes, scene, seen
-            Of the scene without this frame, (rows, columns).
+        cores : Cores
+            Of the frame.
+        pose : Pose
+            How the frame lies on the scene.
+        values, weights : numpy.ndarray
+            (N,), what the cores show at the brightness of the scene.
+        scene : numpy.ndarray
+            (rows, columns), the scene without this frame, on the nodes of the memory.
+        memory : Memory
+            It knows how much each node has been seen.
         """
         square = 0.0
         if abs(step) > _LEAST_STEP * self._pitch:
-            square = _score(step, points, values, weights, nodes, scene, seen) * (abs(step) / self._pitch) ** 2
+            nodes, enough = memory.nodes, np.float32(_LEAST_SEEN * memory.growth)
+            way = step / nodes.spacing
+            sums = np.zeros((2, 2))
+            _sum(
+                cores.x,
+                cores.y,
+                *nodes.under(pose),
+                scene,
+                memory.seen,
+                enough,
+                values,
+                weights,
+                way.real,
+                way.imag,
+                sums,
+            )
+            along, across = sums[:, 1] / np.maximum(sums[:, 0], 1e-12)
+            square = (along - max(across, 0.0)) * (abs(step) / self._pitch) ** 2
         self._squares = [*self._squares, square][-_FRAMES:]
 
 
-def _score(
-    step: complex,
-    points: NDArray[np.complex128],
-    values: Floats,
-    weights: Floats,
-    nodes: Nodes,
+@compiled("f8(f4[:,::1], f8, f8)")
+def _read(scene: Floats, across: Any, down: Any) -> Any:
+    i, j = int(down), int(across)
+    right, below = across - j, down - i
+    top = scene[i, j] * (1 - right) + scene[i, j + 1] * right
+    bottom = scene[i + 1, j] * (1 - right) + scene[i + 1, j + 1] * right
+    return top * (1 - below) + bottom * below
+
+
+@compiled("void(f4[::1], f4[::1], f8, f8, f8, f8, f4[:,::1], f4[:,::1], f4, f4[::1], f4[::1], f8, f8, f8[:,::1])")
+def _sum(
+    x: Floats,
+    y: Floats,
+    u: Any,
+    v: Any,
+    a: Any,
+    b: Any,
     scene: Floats,
     seen: Floats,
-) -> float:
-    """Return by what factor a frame differs from the scene as a smear along its whole step would."""
-    here = nodes.corners(points)
-    sharp = here.read(scene)
-    weights = weights * here.inside * (here.read(seen) > _LEAST_SEEN)
-    left = values - sharp
-    moments = (np.arange(_MOMENTS) + 0.5) / _MOMENTS - 0.5
+    enough: Any,
+    values: Floats,
+    weights: Floats,
+    way_x: Any,
+    way_y: Any,
+    sums: NDArray[np.float64],
+) -> None:
+    """Add up how a smear would change a frame, along a way in nodes and across it.
 
-    def factor(way: complex) -> float:
-        change = np.mean([nodes.corners(points + part * way).read(scene) for part in moments], axis=0) - sharp
-        power = float((weights * change**2).sum())
-        return float((weights * change * left).sum()) / power if power > 0 else 0.0
-
-    return factor(step) - max(factor(1j * step), 0.0)
+    Its power goes into the first column of `sums`, and how far the frame goes with it into the second.
+    """
+    rows, columns = scene.shape
+    reach = 0.5 * max(abs(way_x), abs(way_y))
+    for core in range(len(x)):
+        across, down = u + a * x[core] - b * y[core], v + b * x[core] + a * y[core]
+        if not (reach <= across < columns - 1 - reach and reach <= down < rows - 1 - reach):
+            continue
+        if not seen[int(down), int(across)] > enough:
+            continue
+        sharp = _read(scene, across, down)
+        left = values[core] - sharp
+        for number in range(2):
+            dx, dy = (way_x, way_y) if number == 0 else (-way_y, way_x)
+            total = 0.0
+            for moment in range(_MOMENTS):
+                part = (moment + 0.5) / _MOMENTS - 0.5
+                total += _read(scene, across + part * dx, down + part * dy)
+            change = total / _MOMENTS - sharp
+            sums[number, 0] += weights[core] * change * change
+            sums[number, 1] += weights[core] * change * left

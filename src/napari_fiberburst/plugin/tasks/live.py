@@ -41,6 +41,7 @@ _LIGHTS = {
     "fine": (_GREEN, "Good"),
     "wait": (_YELLOW, "Learning the bundle: move a little over the object"),
     "move a little": (_YELLOW, "Move a little: gaps between the cores are not seen yet"),
+    "hold still": (_YELLOW, "Hold still, or move slower: the picture smears while it is exposed"),
     "too fast": (_RED, "Too fast: move slower"),
     "out of contact": (_RED, "Out of contact: touch the object, or focus"),
     "too bright": (_RED, "Too bright: lower the light or the exposure"),
