@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from napari_fiberburst import Bundle, LiveEngine
+from napari_fiberburst.quality import psnr
 from napari_fiberburst.simulation import simulate_recording
 
 
@@ -68,3 +69,6 @@ def test_a_probe_that_turns_is_followed():
     assert {view.piece for view in views} == {0}
     assert np.ptp([np.arctan2(truth[1, 0], truth[0, 0]) for truth in recording.homographies]) > 0.1
     assert abs(turns[0] - turns[1]) < 0.02
+    inner = (slice(12, -12), slice(12, -12))
+    truths = recording.truth(range(60))[..., 0]
+    assert min(psnr(view.image[inner], truth[inner]) for view, truth in zip(views[20:], truths[20:], strict=True)) > 31

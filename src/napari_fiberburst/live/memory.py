@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
+from scipy.ndimage import map_coordinates
 
 from napari_fiberburst.live.compiled import compiled
 from napari_fiberburst.live.cores import Cores
@@ -104,6 +105,27 @@ class Memory:
             )
         )
         self.scene = np.ascontiguousarray(self.scene[:, along_y[:, None], along_x])
+
+    def turn_to(self, pose: Pose) -> None:
+        """Let nodes lie upright in a frame that lies so, and carry over what was seen.
+
+        Each node has seen what the scene shows there, with the weight of the samples about it, because what they couple
+        does not turn with them.
+        """
+        old, self.nodes = self.nodes, self.nodes.about(pose.middle)
+        columns, rows = (
+            (first + np.arange(count)) * old.spacing
+            for first, count in ((self.nodes.column, old.columns), (self.nodes.row, old.rows))
+        )
+        there = (pose.points(columns + 1j * rows[:, None]) - old.origin) / old.spacing
+        places = np.stack([there.imag, there.real])
+        weight = map_coordinates(self._row_sums(), places, order=1) / self._growth
+        self.scene = np.stack([map_coordinates(scene, places, order=3, mode="nearest") for scene in self.scene])
+        self._total, self._growth = self.density, 1.0
+        self._planes.fill(0)
+        self._planes[0] = np.maximum(weight, 0)
+        self._planes[BANDS:] = self._planes[0] * self.scene
+        self._close()
 
     def forget(self, kept: float) -> None:
         """Keep this part, 0 to 1, of the weight of all that was seen."""

@@ -38,7 +38,7 @@ _ENOUGH_COVERED, _SEEN = 0.7, 0.02
 _FEW_COVERED, _SOFT = 0.8, 0.6
 # Farther than so many pitches from a core nothing is drawn.
 _REACH = 1.0
-# A turn or a zoom that moves corners by more than so many pixels begins a new scene, upright in the newest frame.
+# After a turn or a zoom that moves corners by more than so many pixels the scene lies upright in the newest frame.
 _MOST_TURN = 6.0
 
 
@@ -127,11 +127,11 @@ class Probe:
             self._scene(),
             self._memory,
         )
-        is_new = self._base_on(found.pose, light)
+        self._base_on(found.pose)
         self._missed, self._spectrum = 0, spectrum
         self._usual_contrast += 0.1 * (contrast - self._usual_contrast)
         self._brightness = found.brightness
-        self._add(light, kept, is_new=is_new)
+        self._add(light, kept, is_new=False)
         self._seen_part = covered = self._covered()
         return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
 
@@ -191,15 +191,13 @@ class Probe:
         self._add(light, 1.0, is_new=True)
         return self._view("following", "move a little", 1.0, 0.0, self._covered())
 
-    def _base_on(self, pose: Pose, light: CoreLight) -> bool:
-        """Take a pose; begin a new scene, upright in this frame, where it has turned too far, and return whether."""
-        is_new = pose.corner_motion() > _MOST_TURN
-        if is_new:
+    def _base_on(self, pose: Pose) -> None:
+        """Take a pose; where it has turned far, let the scene lie upright in this frame."""
+        if pose.corner_motion() > _MOST_TURN:
+            self._memory.turn_to(pose)
             self._base = self._base @ pose.matrix
             pose = Pose.at_rest(self._shape)
-            self._memory.clear(light.values.shape[1])
         self._pose = pose
-        return is_new
 
     def _add(self, light: CoreLight, kept: float, *, is_new: bool) -> None:
         memory, height, width = self._memory, *self._shape
