@@ -57,7 +57,7 @@ def test_without_any_layer_live_is_one_click_away_and_asks_for_no_burst(open_doc
 def test_a_replay_is_shown_frozen_and_kept_as_the_burst_it_was(live, qtbot, tmp_path, frames):
     viewer, dock, task = live
     task.source.choose(REPLAY)
-    task.source.rate.setValue(60)
+    task.source.rate.setValue(8)
     task.start_button.click()
     wait_for(qtbot, lambda: "live" in viewer.layers and task.state == "live")
     task.pause_button.click()
@@ -183,3 +183,15 @@ def test_a_command_opens_the_dock_at_the_live_view(live):
     dock.choose_task(PictureTask)
     show_live()
     assert dock.task is dock.live
+
+
+def test_a_replay_that_is_shorter_than_calibration_is_told(live, qtbot, frames):
+    viewer, dock, task = live
+    dock.input.bundle.value = None
+    viewer.add_image(frames[:8], name="short")
+    task.source.choose(REPLAY)
+    task.source.layer.value = viewer.layers["short"]
+    task.source.rate.setValue(10)
+    task.start()
+    wait_for(qtbot, lambda: task.state == "ready")
+    assert "ended before the bundle was learned" in task.words.text()

@@ -93,7 +93,12 @@ class LiveJob:
         self.pasted: Mailbox[Pasted] = Mailbox()
         self.wants_mosaic = False
         self.problem = ""
-        self.is_running = False
+        self.is_running = self._is_told = False
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether it was told to stop."""
+        return self._is_told
 
     @property
     def is_waiting(self) -> float | None:
@@ -105,6 +110,10 @@ class LiveJob:
 
     def stop(self) -> None:
         """End; may be called from any thread, and more than once."""
+        self._is_told = True
+        self._close()
+
+    def _close(self) -> None:
         with self._lock:
             self._stopped.set()
             if self._source is not None:
@@ -131,7 +140,7 @@ class LiveJob:
             logger.exception("a live view has failed")
             self.problem = f"{type(error).__name__}: {error}"
         finally:
-            self.stop()
+            self._close()
             self.is_running = False
 
     def _watch(self) -> None:

@@ -86,6 +86,7 @@ class LiveTask(Task):
         self._jobs: list[LiveJob] = []  # none, or the one that is
         self._kept_of: LiveJob | None = None
         self._frozen: Latest | None = None
+        self._is_learning = False
         self._told = self.rate = self.lag = 0.0
         self._drawing: tuple[float, float] | None = None  # when the last picture was begun, and given to napari
         self._layers: LiveLayers | None = None
@@ -128,7 +129,7 @@ class LiveTask(Task):
         job = LiveJob(opener, None if given is None else given.given, float(self.seconds.value()))
         job.wants_mosaic = self.mosaic.isChecked()
         self._jobs.append(job)
-        self._kept_of, self._frozen, self._drawing = job, None, None
+        self._kept_of, self._frozen, self._drawing, self._is_learning = job, None, None, False
         self._images = Pace(_SHARE)
         atexit.register(job.stop)
         self._follow_state("starting")
@@ -182,6 +183,8 @@ class LiveTask(Task):
         if job.problem:
             self._tell(_RED, job.problem)
             show_error(job.problem)
+        elif self._is_learning and not job.is_stopped:
+            self._tell(_RED, "The source ended before the bundle was learned: choose a bundle, or a longer recording.")
         else:
             self._tell(_GREY, "Stopped. The frames of the last seconds can still be kept.")
         self._follow_state("ready")
@@ -215,6 +218,7 @@ class LiveTask(Task):
         if pasted is not None and self.mosaic.isChecked():
             layers.paste(pasted)
         self._drawing = began, time.perf_counter()
+        self._is_learning = shown.watched.view.state == "calibrating"
         self.rate, self.lag = shown.rate, shown.watched.lag
         self._tell(*_LIGHTS[shown.watched.view.advice])
         if began - self._told > _SECONDS_BETWEEN_NUMBERS:
