@@ -18,14 +18,15 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import FiberBurstError, OutputError
+from napari_fiberburst.io.plain import parse_json
 from napari_fiberburst.io.results import check_place, write_whole
 
 Arrays = dict[str, NDArray[Any]]
 _VERSION = 1
 # The names that the format has for the types of numbers that are stored.
 _DTYPES = {"F64": "<f8", "F32": "<f4", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BOOL": "|b1"}
-# A file begins with the length of its header, in so many bytes.
-_LENGTH = 8
+# A file begins with the length of its header, in so many bytes, which the format bounds.
+_LENGTH, _LONGEST_HEADER = 8, 100_000_000
 
 
 class Stored:
@@ -99,9 +100,9 @@ class Stored:
         """
         arrays, document = cls._read(path)
         try:
-            value: Self = _built(cls, json.loads(document), "", arrays, device)
+            value: Self = _built(cls, parse_json(document), "", arrays, device)
             value._check()
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError, RecursionError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise cls._error(
                 f"{path} holds no complete {cls._kind} ({error}); expected a file that napari-fiberburst has written; "
                 "make it again"
@@ -123,7 +124,7 @@ class Stored:
             arrays = stored.arrays()
         except FiberBurstError:
             raise
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        except (OSError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:
             raise cls._error(
                 f"{path} is no {cls._kind}, or is damaged ({error}); expected a file that napari-fiberburst has "
                 "written; make it again, or take another file"
@@ -157,7 +158,7 @@ class _Safetensors:
 
     Raises
     ------
-    OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError
+    OSError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError
         The file is of another format, or is damaged.
     """
 
@@ -166,9 +167,9 @@ class _Safetensors:
         with path.open("rb") as stream:
             size = path.stat().st_size
             length = int.from_bytes(stream.read(_LENGTH), "little")
-            if not 2 <= length <= size - _LENGTH:
+            if not 2 <= length <= min(size - _LENGTH, _LONGEST_HEADER):
                 raise ValueError(f"it has {size} bytes, and its header is said to have {length}")
-            header = json.loads(stream.read(length))
+            header = parse_json(stream.read(length))
         self.metadata: dict[str, str] = header.pop("__metadata__", {})
         if not all(isinstance(value, str) for value in self.metadata.values()):
             raise ValueError("its metadata must be text")
@@ -176,12 +177,14 @@ class _Safetensors:
 
     def arrays(self) -> Arrays:
         """Return the arrays, which are views of one buffer."""
+        end = max((told["data_offsets"][1] for told in self._tensors.values()), default=0)
+        if self._first + end != self._size:
+            raise ValueError(f"its header tells of {self._first + end} bytes, and it has {self._size}")
         buffer = bytearray(self._size)
         with self._path.open("rb") as stream:
             if stream.readinto(buffer) != self._size:
                 raise ValueError("it was cut short while it was read")
         found: Arrays = {}
-        end = 0
         for name, told in self._tensors.items():
             dtype, shape = np.dtype(_DTYPES[told["dtype"]]), tuple(told["shape"])
             start, stop = told["data_offsets"]
@@ -193,9 +196,6 @@ class _Safetensors:
                 if count
                 else (np.empty(shape, dtype))
             )
-            end = max(end, stop)
-        if self._first + end != self._size:
-            raise ValueError(f"its header tells of {self._first + end} bytes, and it has {self._size}")
         return found
 
 

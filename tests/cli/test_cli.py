@@ -1,5 +1,6 @@
 """The command line, as a user types it."""
 
+import io
 import json
 import os
 import signal
@@ -134,6 +135,32 @@ def test_info_tells_what_a_burst_holds(burst_file, capsys):
     told = capsys.readouterr().out
     assert "33 x 41" in told
     assert "uint8" in told
+
+
+def test_a_terminal_without_the_sign_of_the_micrometre_gets_what_it_can_show(tmp_path, rng, monkeypatch):
+    frames = rng.integers(0, 256, (3, 33, 41), dtype=np.uint8)
+    sizes = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.75, "PhysicalSizeXUnit": "µm", "PhysicalSizeYUnit": "µm"}
+    tifffile.imwrite(tmp_path / "zwölf.ome.tif", frames, photometric="minisblack", metadata={"axes": "TYX", **sizes})
+    shown, said = (io.TextIOWrapper(io.BytesIO(), encoding="ascii", errors="strict") for _ in range(2))
+    monkeypatch.setattr(sys, "stdout", shown)
+    monkeypatch.setattr(sys, "stderr", said)
+    assert main(["info", str(tmp_path / "zwölf.ome.tif")]) == 0
+    assert rb"0.75 x 0.5 \xb5m" in shown.buffer.getvalue()
+    assert main(["info", str(tmp_path / "elf\udcfc.tif")]) == 2
+    said.flush()
+    assert rb"elf\udcfc.tif" in said.buffer.getvalue()
+
+
+@pytest.mark.parametrize("command", [["--version"], ["info", "burst.tif"]])
+def test_a_pipe_that_nobody_reads_ends_the_command_quietly(tmp_path, rng, monkeypatch, capfd, command):
+    monkeypatch.chdir(tmp_path)
+    tifffile.imwrite("burst.tif", rng.integers(0, 256, (3, 33, 41), dtype=np.uint8), photometric="minisblack")
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert main(command) == 141
+    assert capfd.readouterr().err == ""
 
 
 def test_reconstruct_writes_an_image(burst_file, tmp_path, capsys):

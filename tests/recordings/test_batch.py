@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -132,8 +133,13 @@ def test_a_batch_of_bursts_has_an_image_of_each(folder, tmp_path):
 
 def test_settings_are_checked_before_anything_is_opened(tmp_path):
     file = tmp_path / "batch.toml"
+    os.mkfifo(file)
+    with pytest.raises(SettingsError, match=r"cannot be read as TOML \(it is no file\)"):
+        read_settings(file, "mosaic")
+    file.unlink()
     for text, said in (
         ("[mosaic", "cannot be read as TOML"),
+        (f"deep = {'[' * 5000}{']' * 5000}", "cannot be read as TOML"),
         ("[movie]", r"movie .* is no table that is known; expected \[recording\], \[mosaic\], \[video\], \[burst\]"),
         ("[mosaic]\nspeed = 1", "speed is no setting of a mosaic"),
         ("[mosaic]\nmotion = 'wild'", "motion must be one of auto, translation, similarity"),

@@ -1,14 +1,18 @@
 """Reconstruction and Canvas: where images lie, at any size."""
 
 import json
+import os
+import struct
+import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from napari_fiberburst import load
+from napari_fiberburst import load, reconstruct
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.errors import OutputError, SettingsError
+from napari_fiberburst.errors import FiberBurstError, OutputError, SettingsError
+from napari_fiberburst.simulation import simulate
 
 
 def test_a_canvas_at_scale_1_is_the_frame():
@@ -218,3 +222,94 @@ def test_a_file_of_other_networks_is_refused(result, tmp_path):
         np.savez(tmp_path / f"{number}.npz", **damaged)
         with pytest.raises(OutputError, match="that this version can read"):
             load(tmp_path / f"{number}.npz")
+
+
+@pytest.fixture(scope="module")
+def spline(tmp_path_factory):
+    burst = simulate("cat", shape=(43, 51), frames=4, pitch=5.0, channels=1).burst
+    return reconstruct(burst, device="cpu").save(tmp_path_factory.mktemp("spline") / "scene.npz")
+
+
+def contents(path):
+    with np.load(path) as stored:
+        return dict(stored)
+
+
+def refused_or_valid(path, good):
+    """Whether a damaged result is refused as such; where it is not, its image must be one."""
+    try:
+        image = load(path, "cpu").image
+    except FiberBurstError:
+        return True
+    assert image.shape == good.shape
+    assert not np.isinf(image).any()
+    assert not np.isnan(image).all()
+    return False
+
+
+def test_a_result_whose_bytes_are_damaged_is_refused_or_the_same(spline, tmp_path):
+    good, whole, random = load(spline, "cpu").image, spline.read_bytes(), np.random.default_rng(5)
+    damaged, refused = tmp_path / "scene.npz", 0
+    for number, place in enumerate(random.integers(0, len(whole), 150)):
+        other = bytes(random.integers(0, 256, 16, dtype=np.uint8))
+        tail = (b"", bytes([whole[place] ^ 1 << number % 8]) + whole[place + 1 :], other + whole[place + 16 :])
+        damaged.write_bytes(whole[:place] + tail[number % 3])
+        is_refused = refused_or_valid(damaged, good)
+        if not is_refused:
+            np.testing.assert_array_equal(load(damaged, "cpu").image, good)
+        refused += is_refused
+    assert refused > 100
+
+
+def test_a_result_whose_words_are_damaged_is_refused_or_has_an_image(spline, tmp_path):
+    good, arrays, random = load(spline, "cpu").image, contents(spline), np.random.default_rng(7)
+    text = str(arrays["provenance"])
+    told = json.loads(text)
+    signs = list('0123456789-e.,"x[]{}ntf')
+    altered = [
+        text[:place] + str(random.choice(signs)) + text[place + 1 :] for place in random.integers(0, len(text), 120)
+    ]
+    for name in told:
+        altered += [json.dumps({**told, name: value}) for value in (None, [], "x", -1, 10**12, [[1]])]
+    for shape in ([0, 0], [-1, 3], [10**5, 10**5], [3], "ab", [2.5, 3]):
+        altered.append(json.dumps({**told, "canvas": {**told["canvas"], "shape": shape}}))
+    altered += ['{"a":' * depth + "1" + "}" * depth for depth in (500, 5000)]
+    for words in altered:
+        np.savez(tmp_path / "scene.npz", **{**arrays, "provenance": np.array(words)})
+        try:
+            refused_or_valid(tmp_path / "scene.npz", good)
+        except AssertionError:  # another size is one that the words can tell
+            assert json.loads(words)["canvas"]["shape"] != list(good.shape)
+
+
+def test_a_result_whose_arrays_are_damaged_is_refused_or_has_an_image(spline, tmp_path):
+    good, arrays = load(spline, "cpu").image, contents(spline)
+    for name in ("scene", "known", "nodes", "drawing", "homographies"):
+        array = arrays[name]
+        others = [np.array(3), array[:0], array[:1], array.astype(str), array.astype(np.float64)]
+        if array.dtype.kind == "f":
+            others += [np.full_like(array, value) for value in (np.nan, np.inf, 0)]
+        for other in others:
+            np.savez(tmp_path / "scene.npz", **{**arrays, name: other})
+            refused_or_valid(tmp_path / "scene.npz", good)
+
+
+@pytest.mark.parametrize(("name", "value"), [("scene", np.nan), ("drawing", np.inf)])
+def test_a_result_that_shows_nothing_is_refused(spline, tmp_path, name, value):
+    arrays = contents(spline)
+    np.savez(tmp_path / "scene.npz", **{**arrays, name: np.full_like(arrays[name], value)})
+    with pytest.raises(OutputError, match=r"its image is NaN or infinity.*make it again"):
+        load(tmp_path / "scene.npz", "cpu")
+
+
+def test_a_result_that_would_fill_the_memory_is_refused(spline, tmp_path):
+    bomb = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("scene.npy", b"\0" * 4000)
+    data = bomb.read_bytes()
+    place = data.index(b"PK\x01\x02") + 24  # where the directory tells the size of the first member
+    bomb.write_bytes(data[:place] + struct.pack("<I", 3 * 10**9) + data[place + 4 :])
+    os.mkfifo(tmp_path / "pipe.npz")
+    for name, said in (("bomb.npz", "claims 2,861 MiB"), ("pipe.npz", "is a pipe or a device")):
+        with pytest.raises(OutputError, match=said):
+            load(tmp_path / name, "cpu")

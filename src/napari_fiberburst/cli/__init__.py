@@ -1,7 +1,9 @@
 """The command ``fiberburst``: reconstruct, mosaic, video, film, live, batch, calibrate, simulate, demo, info."""
 
 import argparse
+import io
 import logging
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -12,12 +14,31 @@ from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import FiberBurstError
 
 TERMINATED = 143
+UNREAD = 141
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0, 2 for input it cannot use, 130 when interrupted."""
+    """Run the command and return its exit status.
+
+    0; 2 for input it cannot use; 130 when interrupted; 141 where nobody reads on, as behind ``| head``.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack signs, such as that of the micrometre
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            return _run(sys.argv[1:] if arguments is None else list(arguments))
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        # What is left to be written would fail again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return UNREAD
+
+
+def _run(words: list[str]) -> int:
     logging.basicConfig(format="fiberburst: %(message)s", level=logging.WARNING)
-    words = sys.argv[1:] if arguments is None else list(arguments)
     options = _parser().parse_args(words, argparse.Namespace(words=words))
     # A run that is told to end, as by a batch queue, takes its half-written files with it.
     before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED))

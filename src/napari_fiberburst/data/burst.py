@@ -12,6 +12,8 @@ from napari_fiberburst.data.layout import Layout
 from napari_fiberburst.errors import BurstError
 
 MIN_SIDE = 16
+# Values of a frame, pixels times channels; as float32 they take 1 GiB.
+MOST_VALUES = 2**28
 _FULL_SCALES = tuple(2**bits - 1 for bits in range(8, 33, 2))
 
 
@@ -200,7 +202,7 @@ def _stack(frames: Any) -> NDArray[Any]:
 
 
 def check_size(shape: tuple[int, ...]) -> None:
-    """Refuse frames (T, H, W, C) that are none or too small.
+    """Refuse frames (T, H, W, C) that are none, too small, or larger than any camera's.
 
     Raises
     ------
@@ -213,6 +215,22 @@ def check_size(shape: tuple[int, ...]) -> None:
         raise BurstError(
             f"frames need at least {MIN_SIDE} pixels a side, got {shape[1]} x {shape[2]} with {shape[3]} channels; "
             'if the axes stand in another order, name them, such as axes="CTYX"'
+        )
+    check_frame(*shape[1:])
+
+
+def check_frame(height: int, width: int, channels: int) -> None:
+    """Refuse a frame that is larger than any camera's, before memory is taken for it.
+
+    Raises
+    ------
+    BurstError
+        It has more than 2**28 values.
+    """
+    if int(height) * int(width) * int(channels) > MOST_VALUES:
+        raise BurstError(
+            f"a frame may have {MOST_VALUES:,} values (pixels times channels) at most, got {height} x {width} with "
+            f"{channels} channels; crop it, or check the file, which may be damaged"
         )
 
 

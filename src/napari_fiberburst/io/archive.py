@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.bounds import open_arrays
 from napari_fiberburst.io.recording import Recording
 
 # Of a simulated burst with its truth: numpy's archive, under a name that no other reader of napari's claims. Earlier
@@ -22,10 +21,10 @@ def read_archive(path: Path) -> Recording:
     Raises
     ------
     BurstError
-        It has several arrays and none of that name, or is no archive.
+        It has several arrays and none of that name, is no archive, or would take far more memory than it has bytes.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with open_arrays(path) as arrays:
             names = list(arrays)
             if "frames" not in names and len(names) != 1:
                 raise BurstError(f"{path} needs an array named 'frames'; it has {', '.join(names) or 'none'}")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.bounds import check_file
 from napari_fiberburst.io.lazy import Parts
 from napari_fiberburst.io.recording import Recording
 from napari_fiberburst.io.tiff import TIFF_ENDINGS, read_tiff
@@ -77,7 +78,8 @@ def read_image(path: str | Path) -> NDArray[Any]:
         raise BurstError(f"expected the file of an image, ending in {', '.join(endings)}; got {path}")
     try:
         if file.suffix.lower() == ".npy":
-            return np.asarray(np.load(file, allow_pickle=False))
+            # Mapped first, because only so is what it claims held to what it has.
+            return np.array(np.load(file, mmap_mode="r", allow_pickle=False))
         if file.suffix.lower() == ".png":
             return _read_png(file)
     except BurstError:
@@ -105,6 +107,7 @@ def _read_page(path: Path) -> NDArray[Any]:
 
 
 def _read_png(path: Path) -> NDArray[Any]:
+    check_file(path)
     try:
         with Image.open(path) as image:
             depth = path.read_bytes()[_PNG_BIT_DEPTH]

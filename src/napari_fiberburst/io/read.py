@@ -1,5 +1,6 @@
 """Open a burst from whatever it lies in."""
 
+import math
 from pathlib import Path
 
 from napari_fiberburst.data.burst import Burst
@@ -10,6 +11,8 @@ from napari_fiberburst.io.sources import about, open_unread
 
 # A video of more frames is a recording that a burst is to be chosen from.
 _MOST_UNASKED = 200
+# Values of a burst, all of which is in memory: 8 GiB as float32, or 20 frames of 100 million pixels.
+_MOST_VALUES = 2**31
 
 
 def read_burst(
@@ -45,7 +48,7 @@ def read_burst(
     Raises
     ------
     BurstError
-        There is nothing at the path, it cannot be read, or its frames are no burst.
+        There is nothing at the path, it cannot be read, or its frames are no burst, or more than 8 GiB of one.
     """
     with about(path):
         unread = open_unread(path, axes)
@@ -54,6 +57,12 @@ def read_burst(
             raise BurstError(
                 f"{path} has {len(numbers)} frames, which is a recording rather than a burst; choose some 20 of them "
                 f'by frames="0:20" (--frames 0:20); fiberburst info {path} offers some that suit'
+            )
+        values = len(numbers) * math.prod(unread.shape[1:])
+        if values > _MOST_VALUES:
+            raise BurstError(
+                f"{len(numbers)} frames of {path} take {4 * values / 2**30:.0f} GiB of memory, expected "
+                f'{4 * _MOST_VALUES / 2**30:.0f} at most; choose fewer of them by frames="0:20" (--frames 0:20)'
             )
         pixels = unread.reader(numbers)
         known = dict(unread.metadata)

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.bounds import open_arrays
+from napari_fiberburst.io.plain import parse_json, read_json
 
 IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 REPRESENTATION_ENDING = ".npz"
@@ -156,12 +158,14 @@ def read_representation(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict
     Raises
     ------
     OutputError
-        The file is not there, damaged, or something else.
+        The file is not there, damaged, or something else, or claims more than it can hold.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with open_arrays(path, OutputError) as stored:
             arrays = {name: stored[name] for name in stored}
-        return arrays, json.loads(str(arrays.pop("provenance")))
+        return arrays, parse_json(str(arrays.pop("provenance")))
+    except OutputError:
+        raise
     except Exception as error:  # a damaged archive fails in zipfile, zlib, numpy or json
         raise OutputError(
             f"{path} is no saved reconstruction ({type(error).__name__}: {error}); expected a .npz file written by "
@@ -233,8 +237,8 @@ def _is_among(target: Path, source: Path) -> bool:
 
 def _is_ours(path: Path) -> bool:
     try:
-        told = json.loads(path.read_bytes())
-    except ValueError:
+        told = read_json(path)
+    except OutputError:
         return False
     return isinstance(told, dict) and told.get("software") == _SOFTWARE
 

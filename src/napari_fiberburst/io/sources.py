@@ -16,6 +16,7 @@ from napari_fiberburst.data.layout import Layout
 from napari_fiberburst.data.source import FrameSource, Reader
 from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.archive import ARCHIVE_ENDINGS, read_archive
+from napari_fiberburst.io.bounds import check_file
 from napari_fiberburst.io.folder import IMAGE_ENDINGS, natural_key, read_images
 from napari_fiberburst.io.frames import chosen_frames
 from napari_fiberburst.io.recording import Recording
@@ -188,7 +189,10 @@ def _open(path: Path) -> tuple[Recording | Unread, tuple[Path, ...]]:
         raise BurstError(f"there is no {path}; expected {_FORMATS}")
     if path.is_dir():
         if is_zarr(path):
-            return read_zarr(path), tuple(file for file in path.rglob("*") if file.is_file())
+            files = [item for item in path.rglob("*") if not item.is_dir()]
+            for file in files:
+                check_file(file)
+            return read_zarr(path), tuple(files)
         # A dot in front hides a file: those are some system's notes on an image, not images.
         files = [item for item in path.iterdir() if item.is_file() and item.name[0] != "."]
         known = [item for item in files if item.suffix.lower() in IMAGE_ENDINGS]

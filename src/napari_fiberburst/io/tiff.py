@@ -1,17 +1,21 @@
 """TIFF stacks, with what OME and ImageJ metadata say of axes, pixel size, channels and times."""
 
 import logging
+import math
 import struct
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from napari_fiberburst.data.burst import check_frame
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.bounds import check_file, check_packed
 from napari_fiberburst.io.lazy import Handle, Parts
 from napari_fiberburst.io.recording import Recording, with_time
 from napari_fiberburst.io.results import write_whole
@@ -19,6 +23,8 @@ from napari_fiberburst.io.results import write_whole
 logger = logging.getLogger(__name__)
 
 TIFF_ENDINGS = (".tif", ".tiff")
+# Pages that OME metadata may tell of; tifffile takes memory for each, whether it is there or not.
+_MOST_PAGES = 2**22
 _SECONDS = {"ns": 1e-9, "µs": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 
 
@@ -30,15 +36,13 @@ def read_tiff(path: Path) -> Recording:
     Raises
     ------
     BurstError
-        The file is empty, cut short, of pages of different sizes, or no TIFF.
+        The file is empty, cut short, of pages of different sizes, no TIFF, or claims more than it can hold.
     """
-    if path.stat().st_size == 0:
-        raise BurstError(f"{path} is empty; copy or export it again")
+    check_file(path)
     try:
         handle = Handle(partial(_OpenTiff, path))
         with handle.use() as tiff:
-            if _is_cut_short(tiff.file):
-                raise BurstError(f"{path} is cut short, or parts of it are missing; copy or export it again")
+            _check_whole(path, tiff.file)
             blank, axes = _light(np.zeros(tiff.part, tiff.dtype), tiff.part_axes, tiff.keyframe)
             pixels = Parts(_Pages(path, handle), tiff.leading, blank.shape, blank.dtype)
             axes = with_time(tiff.leading_axes + axes)
@@ -60,6 +64,7 @@ def describe_tiff(path: Path) -> dict[str, Any]:
     """
     try:
         with tifffile.TiffFile(path) as file:
+            _check_told(path, file)
             series = file.series[0]
             axes = with_time(series.axes)
             return _described(file, series.shape[axes.index("T")] if "T" in axes else 1)
@@ -94,26 +99,53 @@ def write_frames(
         tifffile.imwrite(stream, shown, ome=True, photometric="rgb" if is_colour else "minisblack", metadata=described)
 
 
-def _is_cut_short(file: tifffile.TiffFile) -> bool:
-    """Whether pages or pixels that the file points to are not in it.
+def _check_told(path: Path, file: tifffile.TiffFile) -> None:
+    """Refuse OME metadata that tell of more pages than any file has, before they are looked for."""
+    if not (file.is_ome and file.ome_metadata):
+        return
+    try:
+        document = ElementTree.fromstring(file.ome_metadata)
+        told = [[int(part.get(f"Size{axis}", 1)) for axis in "TCZYX"] for part in document.findall(".//{*}Pixels")]
+    except (ElementTree.ParseError, ValueError):
+        return  # tifffile goes by the pages alone then
+    most = _MOST_PAGES * math.prod(file.pages.first.shape)
+    for sizes in told:
+        if math.prod(sizes) > most:
+            raise BurstError(
+                f"the OME metadata of {path} tell of {' x '.join(map(str, sizes))} pixels (TCZYX), where its pages "
+                f"have {' x '.join(map(str, file.pages.first.shape))}; export it again"
+            )
+
+
+def _check_whole(path: Path, file: tifffile.TiffFile) -> None:
+    """Refuse a file that points to pages or pixels that are not in it, or that cannot hold what it claims.
 
     tifffile logs this at most, and reads what is left as if it were the whole.
     """
+    if _lacks_pages(file) or any(_lacks_pixels(path, series) for series in file.series):
+        raise BurstError(f"{path} is cut short, or parts of it are missing; copy or export it again")
+
+
+def _lacks_pages(file: tifffile.TiffFile) -> bool:
     handle, layout = file.filehandle, file.tiff
     last = file.pages[len(file.pages) - 1].offset
     handle.seek(last)
     (tags,) = struct.unpack(layout.tagnoformat, handle.read(layout.tagnosize))
     handle.seek(last + layout.tagnosize + tags * layout.tagsize)
     (following,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
-    if following != 0:  # a further page, of which nothing could be read
-        return True
-    return any(map(_lacks_pixels, file.series))
+    return bool(following != 0)  # a further page, of which nothing could be read
 
 
-def _lacks_pixels(series: tifffile.TiffPageSeries) -> bool:
+def _lacks_pixels(path: Path, series: tifffile.TiffPageSeries) -> bool:
     if series.dataoffset is not None:  # pages follow one another, so that not each need be looked at
         return bool(series.dataoffset + series.nbytes > series.keyframe.parent.filehandle.size)
-    return any(page is None or _end_of(page) > page.parent.filehandle.size for page in series.pages)
+    stored = 0
+    for page in series.pages:
+        if page is None or _end_of(page) > page.parent.filehandle.size:
+            return True
+        stored += sum(page.databytecounts)
+    check_packed(path, series.nbytes, stored)
+    return False
 
 
 def _end_of(page: Any) -> int:
@@ -126,6 +158,7 @@ class _OpenTiff:
     def __init__(self, path: Path) -> None:
         self.file = tifffile.TiffFile(path)
         try:
+            _check_told(path, self.file)
             first, *others = self.file.series
             # An OME file may hold further images, of which the first is the one.
             self._series = [first] if self.file.is_ome else [first, *others]
@@ -145,6 +178,8 @@ class _OpenTiff:
             self.leading = (len(self._series),) * several + first.shape[:split]
             self.leading_axes = "T" * several + first.axes[:split]
             self.part, self.part_axes = first.shape[split:], first.axes[split:]
+            sizes = dict(zip(self.part_axes, self.part, strict=True))
+            check_frame(*(sizes.get(axis, 1) for axis in "YXS"))
         except BaseException:
             self.file.close()
             raise

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.io.bounds import check_file
 from napari_fiberburst.io.pyav import import_av
 
 VIDEO_ENDINGS = (
@@ -27,8 +28,7 @@ def open_video(path: Path) -> tuple[Any, Any]:
         It is empty, no video, without pictures, or of a codec that is missing.
     """
     av = import_av(f"reading {path}")
-    if path.stat().st_size == 0:
-        raise BurstError(f"{path} is empty; copy or export it again")
+    check_file(path)
     try:
         container = av.open(str(path))
     except av.error.FFmpegError as error:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.coordinates import in_pixels, relative_to, unit_from_pixel
-from napari_fiberburst.data.burst import Acquisition
+from napari_fiberburst.data.burst import Acquisition, check_frame
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.device import find_device
-from napari_fiberburst.errors import FiberBurstError, OutputError
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.quality.resolution import RingCorrelation
@@ -131,7 +131,7 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
     Raises
     ------
     OutputError
-        The file is not there or is no saved reconstruction.
+        The file is not there, is no saved reconstruction, or is one whose image is NaN or infinity.
     DeviceError
         The device is not on this machine.
     """
@@ -139,8 +139,10 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
     arrays, provenance = read_representation(path)
     try:
         return _rebuild(arrays, _with_names_of_today(provenance), place)
-    except (FiberBurstError, KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
-        raise OutputError(f"{path} is no reconstruction that this version can read: {error!r}") from error
+    except Exception as error:  # contents that do not belong together fail anywhere, in numpy, scipy or torch
+        raise OutputError(
+            f"{path} is no reconstruction that this version can read ({error!r}); make it again, or take another file"
+        ) from error
 
 
 def _with_names_of_today(plain: Any) -> Any:
@@ -153,10 +155,7 @@ def _with_names_of_today(plain: Any) -> Any:
 def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
     settings = Settings.from_dict(provenance["settings"])
     acquisition = Acquisition.from_dict(provenance["burst"])
-    canvas = Canvas(
-        shape=tuple(provenance["canvas"]["shape"]),
-        reference_from_image=np.array(provenance["canvas"]["reference_from_image"]),
-    )
+    canvas = _canvas(provenance["canvas"], acquisition)
     reference = int(provenance.get("reference", 0))
     renderer: SplineImage | Representation
     if isinstance(settings.method, SplineMethod):
@@ -166,7 +165,7 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         renderer = _rebuild_networks(arrays, settings.method, acquisition, device)
         homographies = renderer.homographies()
     return Reconstruction(
-        image=draw(renderer, canvas, reference, acquisition),
+        image=_drawn(renderer, canvas, reference, acquisition),
         canvas=canvas,
         homographies=homographies,
         losses=np.array([np.nan if loss is None else loss for loss in provenance["losses"]], dtype=np.float32),
@@ -189,6 +188,24 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         agreement=_agreement(provenance),
         notes=tuple(provenance.get("notes", ())),
     )
+
+
+def _canvas(told: dict[str, Any], acquisition: Acquisition) -> Canvas:
+    height, width = told["shape"]
+    if not (isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0):
+        raise ValueError(f"an image of {height!r} x {width!r} pixels cannot be drawn")
+    check_frame(height, width, acquisition.shape[3])
+    return Canvas(shape=(height, width), reference_from_image=np.array(told["reference_from_image"]))
+
+
+def _drawn(
+    renderer: SplineImage | Representation, canvas: Canvas, frame: int, acquisition: Acquisition
+) -> NDArray[np.float32]:
+    """Draw the image; refuse one that shows nothing, which no run has made."""
+    image = draw(renderer, canvas, frame, acquisition)
+    if np.isinf(image).any() or np.isnan(image).all():
+        raise ValueError("its image is NaN or infinity; the file is damaged, so make it again")
+    return image
 
 
 def _per_frame(provenance: dict[str, Any], name: str) -> NDArray[np.float64] | None:

@@ -12,6 +12,7 @@ import numpy as np
 import tifffile
 
 from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
+from napari_fiberburst.io.bounds import open_arrays
 from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
@@ -277,7 +278,7 @@ def _truth(path: Path) -> dict[str, Any]:
     """Return the truth that a simulated burst's file carries."""
     if path.suffix.lower() not in ARCHIVE_ENDINGS:
         return {}
-    with np.load(path, allow_pickle=False) as arrays:
+    with open_arrays(path) as arrays:
         if not {"truth", "homographies"} <= set(arrays):
             return {}
         return _truth_in(arrays)

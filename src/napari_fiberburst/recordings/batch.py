@@ -61,8 +61,8 @@ def read_settings(path: Path | None, task: str, given: Settings | None = None) -
         The file cannot be read, or a name or value in it is unknown.
     """
     try:
-        tables = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        tables = {} if path is None else _tables(path)
+    except (OSError, ValueError, RecursionError) as error:
         raise SettingsError(f"{path} cannot be read as TOML ({error}); mend it, or take another file") from error
     known = ("recording", *TASKS)
     for name, table in tables.items():
@@ -79,6 +79,12 @@ def read_settings(path: Path | None, task: str, given: Settings | None = None) -
     own |= given or {}
     TASKS[task][1]({name: value for name, value in own.items() if name != "bundle"})
     return {"recording": opening, task: own}
+
+
+def _tables(path: Path) -> dict[str, Any]:
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no file")
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def recordings_in(folder: Path, but: Path | None = None) -> list[Path]:

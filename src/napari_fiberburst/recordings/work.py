@@ -23,6 +23,7 @@ import torch
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import ClusterError, FiberBurstError, FullDiskError, OutputError
+from napari_fiberburst.io.plain import read_json
 from napari_fiberburst.io.results import check_free, write_whole
 
 # In the folder of work: what it is, and what it has begun to write outside.
@@ -272,7 +273,7 @@ def claim(folder: Path, identity: dict[str, Any]) -> bool:
         Other work has been begun there; the message names what differs.
     """
     if is_begun(folder):
-        known = json.loads((folder / _IDENTITY).read_text(encoding="utf-8"))
+        known = _told(folder / _IDENTITY, dict)
         names = sorted(set(known) | set(identity))
         other = [name for name in names if known.get(name) != identity.get(name)]
         if other:
@@ -333,7 +334,14 @@ def remove(path: Path) -> None:
 
 def _owned(folder: Path) -> list[Path]:
     file = folder / _OUTPUTS
-    return [Path(path) for path in json.loads(file.read_text(encoding="utf-8"))] if file.exists() else []
+    return [Path(str(path)) for path in _told(file, list)] if file.exists() else []
+
+
+def _told(path: Path, kind: type[Any]) -> Any:
+    value = read_json(path)
+    if not isinstance(value, kind):
+        raise OutputError(f"{path} is not of napari-fiberburst, or is damaged; remove its folder, and begin anew")
+    return value
 
 
 def _write_json(path: Path, value: Any) -> None:

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.plain import read_json
 from napari_fiberburst.io.results import write_whole
 
 
@@ -48,14 +50,18 @@ class Row:
 
     @classmethod
     def load(cls, path: Path, identity: dict[str, Any]) -> "Row | None":
-        """Read a row; None where there is none, or where it is of something else."""
+        """Read a row; None where there is none, or where it is of something else or damaged."""
         if not path.exists():
             return None
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["identity"] != identity:
+        try:
+            kept = read_json(path)
+            if kept["identity"] != identity:
+                return None
+            row = kept["row"].items()
+            told: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in row}
+            return cls(**told)
+        except (OutputError, AttributeError, KeyError, TypeError):
             return None
-        told: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in kept["row"].items()}
-        return cls(**told)
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:
