@@ -31,13 +31,24 @@ ALLOWED = {
     "networks": RESULTS | {"coordinates", "operators", "device", "quality", *STEPS},
     "pipeline": RESULTS | {"coordinates", "operators", "device", "steps", "networks", *STEPS},
     "recordings": RESULTS | {"coordinates", "operators", "quality", "steps", "stored", "pipeline", *STEPS},
-    "live": BASE | {"bundle", "operators", "pipeline"},
+    "live": BASE | {"io", "simulation", "operators", "steps", "bundle", "motion", "pipeline"},
     "report": RESULTS | {"coordinates", "quality"},
     "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", "recordings", "report", "live", ""},
     "memory": BASE,
     "streaming": set(),
     "plugin": RESULTS
-    | {"simulation", "quality", "coordinates", "bundle", "networks", "device", "pipeline", "recordings", "report"}
+    | {
+        "simulation",
+        "quality",
+        "coordinates",
+        "bundle",
+        "networks",
+        "device",
+        "pipeline",
+        "recordings",
+        "report",
+        "live",
+    }
     | {"memory", "streaming"},
 }
 TORCH = {"stored", "device", "operators", "bundle", "motion", "scene", "networks", "pipeline", "recordings", "live"}
