@@ -1,11 +1,15 @@
 """The simulated bundle camera, and how frames are taken from a camera of pymmcore-plus."""
 
+import logging
+import subprocess
+import sys
+
 import numpy as np
 import pytest
-from pymmcore_plus.experimental.unicore import UniMMCore
 
 from napari_fiberburst import FiberBurstError
 from napari_fiberburst.live.camera import CameraSource
+from napari_fiberburst.live.micromanager import UniMMCore
 from napari_fiberburst.live.simulated_camera import SimulatedBundleCamera, simulated_core
 
 
@@ -60,3 +64,10 @@ def test_no_camera_and_a_running_one_are_refused(core, tmp_path):
     core.stopSequenceAcquisition()
     with pytest.raises(FiberBurstError, match="no camera is loaded"):
         CameraSource(UniMMCore(mm_path=str(tmp_path)))
+
+
+def test_the_log_of_others_stays_as_it_was():
+    """In a process of its own, because what is imported is not imported again."""
+    program = "import logging, napari_fiberburst.live.simulated_camera; print(logging.root.level)"
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert int(told) == logging.WARNING

@@ -11,7 +11,7 @@ from napari_fiberburst.live.clocks import Clock, RealClock
 from napari_fiberburst.live.sources import Latest
 
 if TYPE_CHECKING:
-    from pymmcore_plus import CMMCorePlus
+    from napari_fiberburst.live.micromanager import CMMCorePlus
 
 # Seconds between looks for a new frame.
 _POLL = 0.002

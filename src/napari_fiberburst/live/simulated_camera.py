@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymmcore_plus.core import Keyword
-from pymmcore_plus.experimental.unicore import SimpleCameraDevice, UniMMCore
 
+from napari_fiberburst.live.micromanager import Keyword, SimpleCameraDevice, UniMMCore
 from napari_fiberburst.simulation import Camera, simulate_recording
 
 LABEL = "Simulated bundle camera"

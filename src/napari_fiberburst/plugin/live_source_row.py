@@ -197,9 +197,8 @@ def _simulated() -> LiveSource:
 
 
 def _camera(configuration: str) -> LiveSource:
-    from pymmcore_plus import CMMCorePlus
-
     from napari_fiberburst.live.camera import CameraSource
+    from napari_fiberburst.live.micromanager import CMMCorePlus
 
     core = CMMCorePlus.instance()
     if configuration:
