@@ -35,6 +35,7 @@ def test_one_task_is_shown_at_a_time_over_the_same_burst(open_dock, burst_layer)
         "Video",
         "Mosaic",
         "Bundle",
+        "Live",
     ]
     for number, shown in enumerate(dock.tasks):
         dock.task_bar.setCurrentIndex(number)
