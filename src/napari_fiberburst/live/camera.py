@@ -3,7 +3,6 @@
 from threading import Event, Lock
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError
@@ -96,9 +95,4 @@ class CameraSource:
         first, self._count = self._count, self._count + len(frames)
         dropped = max(0, len(frames) - n)
         shown = [frame if frame.ndim == 3 else frame[..., None] for frame in frames[dropped:]]
-        return Latest(
-            frames=np.stack(shown) if shown else np.empty((0, 0, 0, 1), np.uint8),
-            indices=np.arange(first + dropped, self._count),
-            times=np.full(len(shown), self.clock.now()),
-            dropped=dropped,
-        )
+        return Latest.of(shown, first + dropped, self.clock.now(), dropped)

@@ -9,6 +9,8 @@ from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from napari_fiberburst.live.peak import beyond
+
 Floats = NDArray[np.float32]
 
 # A cell of the small images, pitches, and over how many cells they are evened out.
@@ -77,7 +79,5 @@ class Finder:
 
 
 def _peak(line: Floats, place: int) -> float:
-    """Return how far beyond a highest value, -0.5 to 0.5, a parabola through its neighbours has its peak."""
-    before, at, after = line[place - 1], line[place], line[(place + 1) % len(line)]
-    bend = before - 2 * at + after
-    return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
+    """Return how far beyond the highest value of a line that closes on itself its peak is."""
+    return beyond(*(float(line[at % len(line)]) for at in (place - 1, place, place + 1)))

@@ -7,7 +7,6 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError
@@ -90,12 +89,7 @@ class Growing:
         return frames
 
     def _as_latest(self, frames: list[NDArray[Any]], first: int, dropped: int) -> Latest:
-        return Latest(
-            frames=np.stack(frames) if frames else np.empty((0, 0, 0, 1), np.uint8),
-            indices=np.arange(first, first + len(frames)) - self._first,
-            times=np.full(len(frames), self.clock.now()),
-            dropped=dropped,
-        )
+        return Latest.of(frames, first - self._first, self.clock.now(), dropped)
 
 
 class _Folder:

@@ -8,6 +8,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter
 
 from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.live.peak import beyond
 
 Floats = NDArray[np.float32]
 Seen = Literal["this", "moved", "another", "unclear"]
@@ -132,9 +133,5 @@ def _middle(side: int) -> slice:
 
 
 def _peak(line: Floats, place: int) -> float:
-    """Return how far beyond a highest value, -0.5 to 0.5, a parabola through its neighbours has its peak."""
-    if not 0 < place < len(line) - 1:
-        return 0.0
-    before, at, after = (float(value) for value in line[place - 1 : place + 2])
-    bend = before - 2 * at + after
-    return float(np.clip((before - after) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0
+    """Return how far beyond the highest value of a line its peak is; at an end of the line that is not known."""
+    return beyond(*map(float, line[place - 1 : place + 2])) if 0 < place < len(line) - 1 else 0.0

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from threading import Condition
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import BurstError, FiberBurstError
@@ -132,12 +131,8 @@ class Ring:
 
 
 def _as_latest(kept: list[_Kept], dropped: int) -> Latest:
-    return Latest(
-        frames=np.stack([one.frame for one in kept]) if kept else np.empty((0, 0, 0, 1), np.uint8),
-        indices=np.array([one.index for one in kept], np.int64),
-        times=np.array([one.seconds for one in kept]),
-        dropped=dropped,
-    )
+    first = kept[0].index if kept else 0
+    return Latest.of([one.frame for one in kept], first, [one.seconds for one in kept], dropped)
 
 
 def _told(frame: NDArray[Any]) -> str:

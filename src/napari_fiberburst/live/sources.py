@@ -1,6 +1,7 @@
 """Where live frames come from: a small protocol, and a recording that is replayed at its own rate."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from threading import Event
 from typing import Any, Protocol
@@ -36,6 +37,18 @@ class Latest:
     indices: NDArray[np.int64]
     times: NDArray[np.float64]
     dropped: int
+
+    @classmethod
+    def of(
+        cls, frames: Sequence[NDArray[Any]], first: int, seconds: float | Sequence[float], dropped: int = 0
+    ) -> "Latest":
+        """Return frames (H, W, C) in a row, numbered from `first` on and taken at these times, or all at one."""
+        return cls(
+            frames=np.stack(frames) if frames else np.empty((0, 0, 0, 1), np.uint8),
+            indices=np.arange(first, first + len(frames)),
+            times=np.broadcast_to(np.asarray(seconds, np.float64), (len(frames),)).copy(),
+            dropped=dropped,
+        )
 
 
 class LiveSource(Protocol):

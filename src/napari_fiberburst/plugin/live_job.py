@@ -77,15 +77,14 @@ class LiveJob:
         The newest mosaic, where `wants_mosaic`.
     wants_mosaic : bool
         Whether pictures are pasted together; may be changed at any time.
-    is_running : bool
-        Whether the worker is at it.
+    is_running, is_stopped : bool
+        Whether the worker is at it, and whether it was told to stop.
     problem : str
         Why it has ended, in words for the user; "" where it was stopped, or the source has come to its end.
     """
 
     def __init__(self, open_source: Callable[[], LiveSource], bundle: Any, seconds: float) -> None:
         self._open, self._bundle, self._seconds = open_source, bundle, seconds
-        self._stopped = threading.Event()
         self._lock = threading.Lock()
         self._source: LiveSource | None = None
         self._ring: Ring | None = None
@@ -93,12 +92,7 @@ class LiveJob:
         self.pasted: Mailbox[Pasted] = Mailbox()
         self.wants_mosaic = False
         self.problem = ""
-        self.is_running = self._is_told = False
-
-    @property
-    def is_stopped(self) -> bool:
-        """Whether it was told to stop."""
-        return self._is_told
+        self.is_running = self.is_stopped = False
 
     @property
     def is_waiting(self) -> float | None:
@@ -110,12 +104,11 @@ class LiveJob:
 
     def stop(self) -> None:
         """End; may be called from any thread, and more than once."""
-        self._is_told = True
+        self.is_stopped = True
         self._close()
 
     def _close(self) -> None:
         with self._lock:
-            self._stopped.set()
             if self._source is not None:
                 self._source.close()
             if self._ring is not None:
@@ -156,7 +149,7 @@ class LiveJob:
 
         with self._lock:
             self._source, self._ring = source, Ring(source.clock, self._seconds)
-            if self._stopped.is_set():
+            if self.is_stopped:
                 source.close()
         recording = threading.Thread(target=self._ring.record, args=(source,), daemon=True)
         recording.start()

@@ -46,16 +46,9 @@ class LayerSource:
             self._come.wait_for(lambda: self._count > self._handed_out or not self._is_open)
             new = self._count - self._handed_out
             if not new or self._newest is None:
-                return Latest(
-                    frames=np.empty((0, 0, 0, 1), np.uint8), indices=np.arange(0), times=np.empty(0), dropped=0
-                )
+                return Latest.of([], self._count, [])
             self._handed_out = self._count
-            return Latest(
-                frames=self._newest[None],
-                indices=np.array([self._count - 1]),
-                times=np.array([self._seconds]),
-                dropped=new - 1,
-            )
+            return Latest.of([self._newest], self._count - 1, self._seconds, new - 1)
 
     def close(self) -> None:
         """End. The layer is let go when it changes next, because this may be another thread than the window's."""
