@@ -3,12 +3,14 @@
     python -m benchmarks.live                    # 256 x 256, two seeds, two levels of noise; some minutes
     python -m benchmarks.live --side 512
     python -m benchmarks.live --side 1024 --pitch 6.5 --seeds 1
-    python -m benchmarks.live --drift 1000       # how far places drift, and how memory grows
+    python -m benchmarks.live --drift 1000       # how far places drift
+    python -m benchmarks.live --hour 100000      # how memory grows over as many frames as an hour has
 
 A hand-held recording of grey frames is pushed frame by frame as fast as it goes (first picture, rate, PSNR of the last
-picture), and replayed at 30 frames a second on the machine's clock (lag, dropped frames). `reconstruct` gets the last
-20 frames and the same bundle; PyFibreBundle, where it is installed, interpolates between the cores of one frame at a
-time, with the true layout and transmission. PSNR is that of frame-wide pictures less a rim, after one gain and offset.
+picture), and replayed at 30 frames a second on the machine's clock (lag, dropped frames; once more without a bundle,
+for how long its first picture takes). `reconstruct` gets the last 20 frames and the same bundle; PyFibreBundle, where it
+is installed, interpolates between the cores of one frame at a time, with the true layout and transmission. PSNR is that
+of frame-wide pictures less a rim, after one gain and offset.
 """
 
 import argparse
@@ -29,14 +31,17 @@ from napari_fiberburst.simulation import Camera, SimulatedRecording, simulate_re
 # Electrons at full scale, and noise in the dark.
 CAMERAS = {"bright": Camera(), "dim": Camera(photons=300, read_noise=0.01)}
 STEP, RATE = 3.0, 30.0
-FRAMES, LAST = 60, 20
+FRAMES, LAST = 150, 20
 # Frames that an engine takes to begin with, and pixels at the rim, that are left out.
 BEGUN, RIM = 5, 12
 # Pixels from frame to frame where drift is measured: few enough that the path stays within two fields.
 SLOW_STEP = 2.0
-COLUMNS = ["seed", "camera", "cores", "first picture", "pictures a second", "picture p95", "lag p50", "lag p95"]
-COLUMNS += ["dropped", "PSNR live", "`reconstruct`", "PyFibreBundle, one frame"]
-DRIFT_COLUMNS = ["seed", "fields", "drift at most", "after all", "memory after 100 frames", "after all"]
+# Frames that go by there and back, again and again, in an hour.
+LOOP = 200
+COLUMNS = ["seed", "camera", "cores", "first picture", "without a bundle", "pictures a second", "picture p95"]
+COLUMNS += ["lag p50", "lag p95", "dropped", "PSNR live", "`reconstruct`", "PyFibreBundle, one frame"]
+DRIFT_COLUMNS = ["seed", "fields", "drift at most", "after all"]
+HOUR_COLUMNS = ["seed", "frames", "memory after a tenth", "after half", "after all", "drift at most", "pieces"]
 
 
 def main() -> None:
@@ -46,12 +51,14 @@ def main() -> None:
     parser.add_argument("--pitch", type=float, default=5.0, help="of the cores, pixels")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--drift", type=int, metavar="FRAMES", help="measure drift over so many frames instead")
+    parser.add_argument("--hour", type=int, metavar="FRAMES", help="measure memory over so many frames instead")
     options = parser.parse_args()
-    if options.drift:
-        _head(DRIFT_COLUMNS)
-        for seed in options.seeds:
-            print(f"| {seed} | {drift(seed, options.side, options.pitch, options.drift)} |", flush=True)
-        return
+    for frames, columns, measure in ((options.drift, DRIFT_COLUMNS, drift), (options.hour, HOUR_COLUMNS, hour)):
+        if frames:
+            _head(columns)
+            for seed in options.seeds:
+                print(f"| {seed} | {measure(seed, options.side, options.pitch, frames)} |", flush=True)
+            return
     _head(COLUMNS)
     for seed in options.seeds:
         for name, camera in CAMERAS.items():
@@ -80,6 +87,7 @@ def row(seed: int, camera: Camera, side: int, pitch: float) -> str:
     cells = (
         f"{len(bundle.centres)}",
         f"{took[0]:.2f} s",
+        f"{_first_without_a_bundle(frames):.1f} s",
         f"{1 / np.mean(took[BEGUN:]):.0f}",
         f"{1000 * np.percentile(took[BEGUN:], 95):.0f} ms",
         f"{median:.0f} ms",
@@ -117,22 +125,53 @@ def drift(seed: int, side: int, pitch: float, count: int) -> str:
         frames=count, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
     )
     true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
-    engine, process = LiveEngine(bundle_of(recording)), psutil.Process()
-    off, memory = [], []
+    engine, off = LiveEngine(bundle_of(recording)), []
     for number in range(count):
         view = engine.push(recording.source.recorded([number])[0, ..., 0])
         off.append(((view.homography - true[number]) @ middle)[:2])
-        memory.append(process.memory_info().rss / 2**20)
     moved = np.linalg.norm(off[LAST:] - np.mean(off[LAST : 2 * LAST], axis=0), axis=1)
     fields = 1 + np.ptp(true[:, :2, 2], axis=0) / side
     cells = (
         f"{fields[0]:.1f} x {fields[1]:.1f}",
         f"{moved.max():.2f} px",
         f"{moved[-LAST:].mean():.2f} px",
-        f"{memory[100]:.0f} MiB",
-        f"{memory[-1]:.0f} MiB",
     )
     return " | ".join(cells)
+
+
+def hour(seed: int, side: int, pitch: float, count: int) -> str:
+    """Return how much memory the process has while frames are pushed, 30 a second on a simulated clock."""
+    recording = simulate_recording(
+        frames=LOOP, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
+    )
+    frames = recording.source.recorded(range(LOOP))[..., 0]
+    true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
+    engine, process = LiveEngine(bundle_of(recording)), psutil.Process()
+    memory, off = [], []
+    for number in range(count):
+        turn = number % (2 * LOOP - 2)
+        at = min(turn, 2 * LOOP - 2 - turn)
+        view = engine.push(frames[at], number / RATE)
+        off.append(np.hypot(*((view.homography - true[at]) @ middle)[:2]))
+        memory.append(process.memory_info().rss / 2**20)
+    cells = (
+        f"{count}",
+        *(f"{memory[int(part * count) - 1]:.0f} MiB" for part in (0.1, 0.5, 1.0)),
+        f"{max(off):.2f} px",
+        f"{view.piece + 1}",
+    )
+    return " | ".join(cells)
+
+
+def _first_without_a_bundle(frames: NDArray[Any]) -> float:
+    """Return how many seconds after the first frame of a replay there is a picture by a bundle that was measured."""
+    with LiveEngine() as engine:
+        source = Replay(open_recording(frames), RATE)
+        start = source.clock.now()
+        for one in watch(source, engine):
+            if one.view.state == "following":
+                return source.clock.now() - start
+    return float("nan")
 
 
 def bundle_of(recording: SimulatedRecording) -> Bundle:

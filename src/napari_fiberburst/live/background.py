@@ -22,10 +22,12 @@ class Background(Generic[Value]):
     waits : bool
         Whether `begin` returns when the job is done, so that what comes of frames does not depend on how long jobs
         take.
+    threads : int or None
+        How many threads torch may use in the job; None for as many as elsewhere. More than one hold up the pictures.
     """
 
-    def __init__(self, *, waits: bool) -> None:
-        self._waits = waits
+    def __init__(self, *, waits: bool, threads: int | None = 1) -> None:
+        self._waits, self._threads = waits, threads
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Value | None] | None = None
         self._stop = threading.Event()
@@ -44,7 +46,7 @@ class Background(Generic[Value]):
             self._job.set_result(drain(job))
             return
         if self._pool is None:
-            self._pool = _pool_of_one()
+            self._pool = _pool_of_one(self._threads)
         self._job = self._pool.submit(_done, job, self._stop)
 
     def taken(self) -> Value | None:
@@ -79,10 +81,11 @@ def _done(job: Job[Value], stop: threading.Event) -> Value | None:
     return None
 
 
-def _pool_of_one() -> ThreadPoolExecutor:
-    """Return a thread in which torch uses no others, because these would hold up the pictures."""
+def _pool_of_one(threads_there: int | None) -> ThreadPoolExecutor:
+    """Return a thread in which torch uses so many others, and as many as before elsewhere."""
     threads = torch.get_num_threads()
-    pool = ThreadPoolExecutor(1, "beside live view", initializer=torch.set_num_threads, initargs=(1,))
+    there = threads if threads_there is None else threads_there
+    pool = ThreadPoolExecutor(1, "beside live view", initializer=torch.set_num_threads, initargs=(there,))
     pool.submit(int).result()
     torch.set_num_threads(threads)  # torch takes the last number that was set for all threads to come, too
     return pool

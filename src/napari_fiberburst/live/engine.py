@@ -19,8 +19,6 @@ from napari_fiberburst.live.view import Advice, LiveView, State
 if TYPE_CHECKING:
     from napari_fiberburst.live.probe import Probe
 
-# Frames after which half of what was seen is forgotten.
-HALF_LIFE = 20.0
 # Part of the weight that is left of a scene that was seen with gains that were far off.
 _KEPT = 0.05
 
@@ -33,8 +31,8 @@ class LiveEngine:
     bundle : Bundle, optional
         Of the frames. Without, the engine calibrates itself from the first twenty frames that differ, spread over a
         second at least where their times are given, in a thread of its own, while it goes on taking frames.
-    half_life : float
-        Frames after which half of what was seen is forgotten.
+    half_life : float, optional
+        Frames after which half of what was seen is forgotten. By default 4 to 20, by how fast what is seen changes.
     black_level, white_level : float, optional
         Intensities without light and at full scale; by default as `Burst` takes them from the first frame.
     improves : bool
@@ -72,19 +70,19 @@ class LiveEngine:
         self,
         bundle: Bundle | None = None,
         *,
-        half_life: float = HALF_LIFE,
+        half_life: float | None = None,
         black_level: float | None = None,
         white_level: float | None = None,
         improves: bool = True,
         waits: bool = False,
     ) -> None:
-        if not 0 < half_life < np.inf:
+        if half_life is not None and not 0 < half_life < np.inf:
             raise BurstError(f"the half-life must be a positive number of frames; got {half_life}")
         from napari_fiberburst.live.probe import Probe  # compiles its loops, once for an installation, or loads them
 
         self._begin = Probe
         self.bundle = bundle
-        self._kept = 0.5 ** (1 / half_life)
+        self._half_life = half_life
         self._asked_levels = black_level, white_level
         self._calibration = Calibration(black_level, white_level, waits=waits)
         self._improving = Improving(black_level, white_level, waits=waits) if improves else None
@@ -142,7 +140,7 @@ class LiveEngine:
             return self._told("calibrating", "wait", pixels, seconds)
         self._probe = probe = self._probe_for(self.bundle, pixels)
         self._last = pixels
-        view = self._with_bundle_watched(probe, pixels, replace(probe.push(pixels, self._kept), seconds=seconds))
+        view = self._with_bundle_watched(probe, pixels, replace(probe.push(pixels), seconds=seconds))
         self._view = view
         if view.state == "following":
             self._improve(probe, pixels)
@@ -152,12 +150,14 @@ class LiveEngine:
         """Return what frames like this one are seen with."""
         before = self._probe
         if before is None:
-            return self._begin(bundle, pixels, Levels.of(pixels, *self._asked_levels))
+            return self._begin(bundle, pixels, Levels.of(pixels, *self._asked_levels), self._half_life)
         if before.dtype != pixels.dtype:
             # Levels are others, and so are frames that were kept.
             if self._improving is not None:
                 self._improving.forget()
-            return self._begin(bundle, pixels, Levels.of(pixels, *self._asked_levels), piece=before.piece + 1)
+            return self._begin(
+                bundle, pixels, Levels.of(pixels, *self._asked_levels), self._half_life, before.piece + 1
+            )
         if self._asked_levels[1] is None:
             before.follow_levels(pixels)
         return before

@@ -12,6 +12,7 @@ from napari_fiberburst.errors import BurstError
 from napari_fiberburst.live.cores import Cores
 from napari_fiberburst.live.finding import Finder
 from napari_fiberburst.live.fitting import Fit, Fitter
+from napari_fiberburst.live.forgetting import Forgetting
 from napari_fiberburst.live.levels import Levels
 from napari_fiberburst.live.memory import Memory
 from napari_fiberburst.live.pose import Pose
@@ -53,6 +54,8 @@ class Probe:
         (H, W) or (H, W, C), the first frame.
     levels : Levels
         Of the frames.
+    half_life : float or None
+        After so many frames one counts half as much; None lets it follow what is seen.
     piece : int
         How many scenes there were before.
 
@@ -64,7 +67,9 @@ class Probe:
         (N,), what the cores show in the newest frame.
     """
 
-    def __init__(self, bundle: Bundle, pixels: NDArray[Any], levels: Levels, piece: int = 0) -> None:
+    def __init__(
+        self, bundle: Bundle, pixels: NDArray[Any], levels: Levels, half_life: float | None, piece: int = 0
+    ) -> None:
         if bundle.shape != pixels.shape[:2]:
             raise BurstError(
                 f"the bundle was measured in frames of {bundle.shape[0]} x {bundle.shape[1]} pixels, and the camera "
@@ -81,6 +86,7 @@ class Probe:
         self._pose = Pose.at_rest(self._shape)
         self._base = np.eye(3)
         self._smear = Smear(bundle.pitch)
+        self._half_life = half_life
         self._spectrum: NDArray[np.complex64] | None = None
         self._usual_contrast, self._brightness = 0.0, 1.0
         self._missed, self.piece, self._seen_part = 0, piece, 0.0
@@ -95,9 +101,15 @@ class Probe:
         self._cores = Cores.of(bundle.centres, self._shape)
         self._fitter = Fitter(self._cores)
         self._finder = Finder(bundle.centres, self._shape, bundle.pitch)
+        self._forgetting = Forgetting(bundle.centres, self._shape, bundle.pitch, bundle.radius)
         self._ground = np.where(_near_cores(bundle), np.float32(bundle.black), np.float32(np.nan))
 
-    def push(self, pixels: NDArray[Any], kept: float) -> LiveView:
+    @property
+    def _remembers(self) -> float:
+        """Frames after which one counts half as much."""
+        return self._forgetting.half_life if self._half_life is None else self._half_life
+
+    def push(self, pixels: NDArray[Any]) -> LiveView:
         """Take in a frame and return the picture."""
         light = self._sampler(pixels.reshape(*self._shape, -1))
         grey = self.light = light.grey
@@ -118,20 +130,16 @@ class Probe:
                 return self._view("lost", "too fast", found.alike)
             self.piece += 1
             return self._begun(light, spectrum, contrast)
-        self._smear.take(
-            found.pose.place - self._pose.place,
-            self._cores,
-            found.pose,
-            grey / np.float32(found.brightness),
-            light.weights,
-            self._scene(),
-            self._memory,
-        )
+        shown, scene = grey / np.float32(found.brightness), self._scene()
+        step = found.pose.place - self._pose.place
+        self._smear.take(step, self._cores, found.pose, shown, light.weights, scene, self._memory)
+        if self._half_life is None:
+            self._forgetting.take(found.pose, shown, light.weights, scene, self._memory)
         self._base_on(found.pose)
         self._missed, self._spectrum = 0, spectrum
         self._usual_contrast += 0.1 * (contrast - self._usual_contrast)
         self._brightness = found.brightness
-        self._add(light, kept, is_new=False)
+        self._add(light, is_new=False)
         self._seen_part = covered = self._covered()
         return self._view("following", self._advised(abs(shift), covered), found.alike, abs(shift), covered)
 
@@ -187,23 +195,26 @@ class Probe:
         self._pose, self._base = Pose.at_rest(self._shape), np.eye(3)
         self._missed, self._spectrum, self._brightness = 0, spectrum, 1.0
         self._smear = Smear(self._bundle.pitch)
+        self._forgetting.begin_anew()
         self._usual_contrast, self._seen_part = contrast, 0.0
-        self._add(light, 1.0, is_new=True)
+        self._add(light, is_new=True)
         return self._view("following", "move a little", 1.0, 0.0, self._covered())
 
     def _base_on(self, pose: Pose) -> None:
         """Take a pose; where it has turned far, let the scene lie upright in this frame."""
         if pose.corner_motion() > _MOST_TURN:
             self._memory.turn_to(pose)
+            self._forgetting.turn_to(pose)
             self._base = self._base @ pose.matrix
             pose = Pose.at_rest(self._shape)
         self._pose = pose
 
-    def _add(self, light: CoreLight, kept: float, *, is_new: bool) -> None:
+    def _add(self, light: CoreLight, *, is_new: bool) -> None:
         memory, height, width = self._memory, *self._shape
         corner = self._pose.place - self._pose.middle
         memory.centre_on(corner, corner + complex(width - 1, height - 1))
-        memory.forget(kept)
+        if not is_new:
+            memory.forget(0.5 ** (1 / self._remembers))
         brightness = np.float32(self._brightness)
         memory.add(self._cores, self._pose, light.values / brightness, light.weights * brightness**2)
         if is_new:
@@ -240,6 +251,7 @@ class Probe:
             brightness=self._brightness,
             speed=speed,
             covered=covered,
+            half_life=self._remembers,
         )
 
 

@@ -16,6 +16,7 @@ from napari_fiberburst.live.compiled import compiled
 from napari_fiberburst.live.cores import Cores
 from napari_fiberburst.live.memory import Memory
 from napari_fiberburst.live.pose import Pose
+from napari_fiberburst.live.reading import read
 
 Floats = NDArray[np.float32]
 
@@ -91,15 +92,6 @@ class Smear:
         self._squares = [*self._squares, square][-_FRAMES:]
 
 
-@compiled("f8(f4[:,::1], f8, f8)")
-def _read(scene: Floats, across: Any, down: Any) -> Any:
-    i, j = int(down), int(across)
-    right, below = across - j, down - i
-    top = scene[i, j] * (1 - right) + scene[i, j + 1] * right
-    bottom = scene[i + 1, j] * (1 - right) + scene[i + 1, j + 1] * right
-    return top * (1 - below) + bottom * below
-
-
 @compiled("void(f4[::1], f4[::1], f8, f8, f8, f8, f4[:,::1], f4[:,::1], f4, f4[::1], f4[::1], f8, f8, f8[:,::1])")
 def _sum(
     x: Floats,
@@ -129,14 +121,14 @@ def _sum(
             continue
         if not seen[int(down), int(across)] > enough:
             continue
-        sharp = _read(scene, across, down)
+        sharp = read(scene, across, down)
         left = values[core] - sharp
         for number in range(2):
             dx, dy = (way_x, way_y) if number == 0 else (-way_y, way_x)
             total = 0.0
             for moment in range(_MOMENTS):
                 part = (moment + 0.5) / _MOMENTS - 0.5
-                total += _read(scene, across + part * dx, down + part * dy)
+                total += read(scene, across + part * dx, down + part * dy)
             change = total / _MOMENTS - sharp
             sums[number, 0] += weights[core] * change * change
             sums[number, 1] += weights[core] * change * left

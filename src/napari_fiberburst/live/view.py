@@ -49,6 +49,8 @@ class LiveView:
         Pixels that the probe has gone since the frame before.
     covered : float
         Part of the field's pixels that cores have looked at of late, 0 to 1.
+    half_life : float
+        Frames after which one counts half as much in the picture.
     seconds : float or None
         When the newest frame was taken, as it was pushed.
     """
@@ -62,4 +64,5 @@ class LiveView:
     brightness: float = 1.0
     speed: float = 0.0
     covered: float = 0.0
+    half_life: float = 0.0
     seconds: float | None = None
