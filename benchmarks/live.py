@@ -8,9 +8,9 @@
 
 A hand-held recording of grey frames is pushed frame by frame as fast as it goes (first picture, rate, PSNR of the last
 picture), and replayed at 30 frames a second on the machine's clock (lag, dropped frames; once more without a bundle,
-for how long its first picture takes). `reconstruct` gets the last 20 frames and the same bundle; PyFibreBundle, where it
-is installed, interpolates between the cores of one frame at a time, with the true layout and transmission. PSNR is that
-of frame-wide pictures less a rim, after one gain and offset.
+for how long its first picture takes). `reconstruct` gets the last 20 frames and the same bundle; PyFibreBundle, where
+it is installed, interpolates between the cores of one frame at a time, with the true layout and transmission. PSNR is
+that of frame-wide pictures less a rim, after one gain and offset.
 """
 
 import argparse
