@@ -81,7 +81,9 @@ def row(seed: int, camera: Camera, side: int, pitch: float) -> str:
         start = time.perf_counter()
         view = engine.push(frame)
         took.append(time.perf_counter() - start)
-    watched = list(watch(Replay(open_recording(frames), RATE), LiveEngine(bundle)))
+    engine.close()  # or else its gains are still measured on while the replay runs
+    with LiveEngine(bundle) as engine:
+        watched = list(watch(Replay(open_recording(frames), RATE), engine))
     median, late = np.percentile([1000 * one.lag for one in watched[BEGUN:]], [50, 95])
     whole = reconstruct(Burst(frames[-LAST:]), bundle=bundle)
     cells = (
@@ -147,17 +149,17 @@ def hour(seed: int, side: int, pitch: float, count: int) -> str:
     frames = recording.source.recorded(range(LOOP))[..., 0]
     true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
     engine, process = LiveEngine(bundle_of(recording)), psutil.Process()
-    memory, off = [], []
+    memory, off = np.zeros(count), np.zeros(count)
     for number in range(count):
         turn = number % (2 * LOOP - 2)
         at = min(turn, 2 * LOOP - 2 - turn)
         view = engine.push(frames[at], number / RATE)
-        off.append(np.hypot(*((view.homography - true[at]) @ middle)[:2]))
-        memory.append(process.memory_info().rss / 2**20)
+        off[number] = np.hypot(*((view.homography - true[at]) @ middle)[:2])
+        memory[number] = process.memory_info().rss / 2**20
     cells = (
         f"{count}",
         *(f"{memory[int(part * count) - 1]:.0f} MiB" for part in (0.1, 0.5, 1.0)),
-        f"{max(off):.2f} px",
+        f"{off.max():.2f} px",
         f"{view.piece + 1}",
     )
     return " | ".join(cells)
@@ -165,8 +167,9 @@ def hour(seed: int, side: int, pitch: float, count: int) -> str:
 
 def _first_without_a_bundle(frames: NDArray[Any]) -> float:
     """Return how many seconds after the first frame of a replay there is a picture by a bundle that was measured."""
+    there_and_back = np.concatenate([frames, frames[::-1]])
     with LiveEngine() as engine:
-        source = Replay(open_recording(frames), RATE)
+        source = Replay(open_recording(there_and_back), RATE)
         start = source.clock.now()
         for one in watch(source, engine):
             if one.view.state == "following":
