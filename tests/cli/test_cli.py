@@ -16,6 +16,8 @@ import tifffile
 from PIL import Image
 from tqdm import tqdm
 
+from napari_fiberburst import __version__
+from napari_fiberburst.__main__ import main as command_line
 from napari_fiberburst.cli import demo, main, reconstruct
 from napari_fiberburst.simulation import Faults, simulate, simulate_recording
 
@@ -343,3 +345,19 @@ def test_the_demo_refuses_a_place_it_cannot_write(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path / "none" / "demo.png")]) == 2
     assert main(["demo", "-o", str(tmp_path / "demo.gif")]) == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_the_command_is_imported_is_a_line(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("napari_fiberburst.cli.main", interrupted)
+    assert command_line() == 130
+    assert capsys.readouterr().err == "\nfiberburst: interrupted; nothing was written\n"
+
+
+def test_the_package_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "napari_fiberburst", "--version"], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout.split()[-1]) == (0, __version__)
