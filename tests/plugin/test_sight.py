@@ -109,6 +109,7 @@ def test_why_a_run_failed_is_seen_whole(window, burst, qtbot):
     picture = dock.picture
     picture.form.set_choices(QUICK)
     picture.display.fail(
-        "the bundle has no cores that could be told apart in these frames; take an image of the bundle in even light"
+        "run 1",
+        "the bundle has no cores that could be told apart in these frames; take an image of the bundle in even light",
     )
     assert_seen(qtbot, dock, picture.start_button, picture.display.status, picture.departures)
