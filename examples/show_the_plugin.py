@@ -5,6 +5,7 @@
 Without a display, put `xvfb-run -s "-screen 0 1280x800x24"` in front.
 """
 
+import contextlib
 import sys
 import tempfile
 from collections.abc import Callable
@@ -89,14 +90,14 @@ class States:
         frames, look, _ = recording_layer(recording.source, "recording")
         self.viewer.add_image(frames, **look)
         self.dock.choose_task(VideoTask)
+        self.dock.task.output.edit.setText("recording-video.ome.zarr")
         self.take("video")
         self.dock.choose_task(MosaicTask)
         task = self.dock.task
-        with tempfile.TemporaryDirectory() as folder:
-            task.output.edit.setText(f"{folder}/recording-mosaic.ome.zarr")
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            task.output.edit.setText("recording-mosaic.ome.zarr")
             task.start_button.click()
-            wait(lambda: bool(task.bar.value()))
-            wait(lambda: task.job is None)
+            wait(lambda: bool(task.words.text()) or task.job is None)
             self.viewer.reset_view()
             self.take("mosaic")
             self.viewer.close()
@@ -160,6 +161,7 @@ class States:
 
 def main(folder: Path) -> None:
     """Write a picture of each state in each theme."""
+    folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     for theme in ("dark", "light"):
         States(folder, theme).show_picture()
