@@ -1,4 +1,7 @@
-"""Print as constraints the lowest versions that pyproject.toml allows: python .ci/lowest.py > lowest.txt"""
+"""Print the lowest versions that pyproject.toml allows, as constraints.
+
+python .ci/lowest.py > lowest.txt
+"""
 
 import re
 import tomllib
