@@ -10,6 +10,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.quality.resolution import RingCorrelation
 
 Quality = Literal["good", "doubtful", "bad"]
+Ending = Literal["finished", "stopped", "time budget", "diverged"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
