@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from napari_fiberburst import Bundle, Control, load, reconstruct
+from napari_fiberburst import Bundle, Control, load, reconstruct, write_report
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.results.diagnostics import Diagnostics
 from napari_fiberburst.results.model import Model
@@ -39,6 +39,7 @@ CASES = {
     ),
     "left out": lambda fit: reconstruct(small(), device="cpu", leave_out=(0, 2)),
     "marks": lambda fit: reconstruct(small(7, overlay=True, flicker=0.1, black_frames=1), device="cpu"),
+    "no first frame": lambda fit: reconstruct(_dark_at_first(), device="cpu"),
     "one frame": lambda fit: reconstruct(
         small(1), device="cpu", bundle=Bundle.from_image(np.full((43, 51), 9) * _flat(), device="cpu")
     ),
@@ -55,6 +56,13 @@ CASES = {
     "network, still": lambda fit: reconstruct(small(), device="cpu", encoding="hash", motion="none", **NETWORK),
     "network, flow": lambda fit: reconstruct(small(), device="cpu", encoding="siren", motion="flow", **NETWORK),
 }
+
+
+def _dark_at_first():
+    """Return frames of which the first one shows nothing, so that another is the reference."""
+    frames = np.array(small(7).frames)
+    frames[0] = 0.001 * np.random.default_rng(0).random(frames[0].shape)
+    return frames[..., 0]
 
 
 def _flat():
@@ -125,6 +133,8 @@ def test_the_cases_have_what_they_are_to_test(fit):
     assert np.isnan(CASES["left out"](fit).image).any()
     assert CASES["rgb"](fit).image.shape[2] == 3
     assert CASES["stopped"](fit).ending == "stopped"
+    assert CASES["no first frame"](fit).reference > 0
+    assert CASES["published, flow"](fit).bends
 
 
 def test_networks_go_on_from_a_model(fit, tiny_burst, tmp_path):
@@ -134,6 +144,11 @@ def test_networks_go_on_from_a_model(fit, tiny_burst, tmp_path):
     longer = fit(tiny_burst, initial=again, iterations=5, learning_rate=3e-3)
     assert len(longer.losses) == 65
     assert longer.losses[60:].mean() < first.losses[:5].mean()
+
+
+def test_a_report_is_made_of_a_model_and_its_burst(grey, kept, tmp_path):
+    told = write_report(load(kept, "cpu"), small(), tmp_path / "report.html").read_text()
+    assert "Where it comes from" in told
 
 
 def test_a_bundle_is_improved_by_a_model(grey, kept):
