@@ -81,6 +81,7 @@ def test_a_model_that_is_dropped_on_the_window_opens(make_napari_viewer, npe2pm,
     viewer.open(str(result.save(tmp_path / "cat.fiberburst")), plugin=None)
     kinds = [layer.name.removeprefix("cat: ") for layer in viewer.layers]
     assert kinds[0] == "image"
+    assert kinds[-3:] == ["outlines", "path", "displacement"]
     assert {type(layer) for layer in viewer.layers} == {Image, Shapes, Tracks, Vectors}
     for layer in viewer.layers:
         layer.visible = True

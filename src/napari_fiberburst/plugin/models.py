@@ -39,11 +39,13 @@ def model_layers(result: "Reconstruction", name: str, burst_look: dict[str, Any]
     for kind in kinds_of(result, placement):
         if kind not in _OF_FRAMES:
             evidence |= result_layers(kind, result, None, placement)
-    for kind, layer in (images | evidence).items():
+    # Images would hide outlines, path and arrows that lay below them.
+    layers = images | dict(sorted(evidence.items(), key=lambda item: not isinstance(item[1], Image)))
+    for kind, layer in layers.items():
         layer.name = f"{name}: {kind}"
         layer.metadata = {METADATA_KEY: {**told, "reconstruction": result} if kind in images else told}
         layer.visible = kind in images
-    return [layer.as_layer_data_tuple() for layer in (images | evidence).values()]
+    return [layer.as_layer_data_tuple() for layer in layers.values()]
 
 
 def _placement(result: "Reconstruction", burst_look: dict[str, Any]) -> Placement:
