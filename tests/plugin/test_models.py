@@ -12,6 +12,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.plugin import contributions
 from napari_fiberburst.plugin.evidence import KINDS, kinds_of
 from napari_fiberburst.plugin.layers import RunLayers
+from napari_fiberburst.plugin.models import model_layers
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.saving import save_result
 from napari_fiberburst.simulation import Faults, simulate
@@ -109,6 +110,22 @@ def test_a_cropped_burst_lies_where_it_was_cropped_from(tmp_path, rng, fit):
     frames = rng.integers(0, 255, (3, 43, 51), dtype=np.uint8)
     result = fit(Burst(frames).crop((5, 40), (7, 44)))
     np.testing.assert_allclose(opened(result, tmp_path)["cat: image"].translate, (5, 7))
+
+
+def test_frames_whose_flow_folds_lie_where_their_homographies_say(tmp_path, rng, fit):
+    result = fit(rng.integers(0, 255, (3, 31, 37), dtype=np.uint8), motion="flow", iterations=1)
+    plain = opened(result, tmp_path)["cat: path"].data
+    folded = replace(result, renderer=_Folded())
+    folded_path = model_layers(folded, "cat", contributions._look(result.acquisition))
+    (drawn,) = [data for data, look, _ in folded_path if look["name"] == "cat: path"]
+    np.testing.assert_allclose(drawn, plain, atol=0.1)  # of a flow that is next to nothing after one step
+
+
+class _Folded:
+    """Draws nothing, and finds no point of any frame again."""
+
+    def displacement(self, points, frame):
+        return np.full(points.shape, np.nan)
 
 
 def test_a_verdict_that_is_not_good_is_told(tmp_path, bent, capsys, monkeypatch):

@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import fields, is_dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -79,6 +80,11 @@ def grey():
     return reconstruct(small(), device="cpu")
 
 
+@pytest.fixture(scope="module")
+def bent(fit):
+    return CASES["bent"](fit)
+
+
 @pytest.fixture
 def kept(grey, tmp_path):
     return grey.save(tmp_path / "cat.fiberburst")
@@ -123,13 +129,10 @@ def test_it_can_be_saved_again(result, tmp_path):
     assert Model.load(first).digest() == Model.load(second).digest()
 
 
-def test_the_cases_have_what_they_are_to_test(fit):
-    bent = CASES["bent"](fit)
+def test_the_cases_have_what_they_are_to_test(fit, bent, grey):
     assert bent.bends
     assert np.nanmax(np.abs(bent.displacement(3))) > 0.1
-    whole = CASES["grey"](fit)
-    empty = {item.name for item in fields(Diagnostics) if getattr(whole, item.name) is None}
-    assert not empty
+    assert not [item.name for item in fields(Diagnostics) if getattr(grey, item.name) is None]
     assert np.isnan(CASES["left out"](fit).image).any()
     assert CASES["rgb"](fit).image.shape[2] == 3
     assert CASES["stopped"](fit).ending == "stopped"
@@ -233,6 +236,10 @@ def _told(name, value):
     return lambda model: replace(model, diagnostics=replace(model.diagnostics, **{name: value}))
 
 
+def _taken(model, **change):
+    return replace(model, acquisition={**model.acquisition, **change})
+
+
 def _deep(depth):
     value = 1
     for _ in range(depth):
@@ -257,6 +264,8 @@ def _deep(depth):
         _with("requested", {"method": {"name": "spline", "motion": {"name": "sideways"}}}),
         _with("acquisition", {}),
         _with("made_with", None),
+        _with("made_with", {"software": "another"}),
+        _with("homographies", np.full((5, 3, 3), np.nan)),
         _with("drawn_from", {}),
         _with("drawn_from", {"scene": np.zeros(3)}),
         _told("coverage", np.zeros((9, 9), np.float32)),
@@ -268,9 +277,24 @@ def _deep(depth):
         _told("reference", 7),
         _told("reference", -1),
         _told("notes", (1, 2)),
-        lambda model: replace(model, acquisition={**model.acquisition, "shape": (10**12, 43, 51, 1)}),
-        lambda model: replace(model, acquisition={**model.acquisition, "shape": (5, 10**9, 10**9, 1)}),
-        lambda model: replace(model, acquisition={**model.acquisition, "axes": "CTYX"}),
+        partial(_taken, shape=(10**12, 43, 51, 1)),
+        partial(_taken, shape=(5, 10**9, 10**9, 1)),
+        *(
+            partial(_taken, **change)
+            for change in (
+                {"axes": "CTYX"},
+                {"dtype": "object"},
+                {"white_level": float("nan")},
+                {"channel_names": [1]},
+                {"pixel_size": 2},
+                {"pixel_size": (0, 1)},
+                {"unit": 3},
+                {"times": [0, 1]},
+                {"origin": ("a", "b")},
+                {"origin": (10**400, 0)},
+            )
+        ),
+        lambda model: replace(model, canvas=replace(model.canvas, reference_from_image=np.zeros((3, 3)))),
         lambda model: replace(model, canvas=replace(model.canvas, shape=(10**9, 10**9))),
         lambda model: replace(model, canvas=replace(model.canvas, reference_from_image=np.full((3, 3), np.nan))),
         lambda model: replace(
@@ -305,8 +329,19 @@ def test_networks_that_claim_to_be_huge_take_no_memory(fit, tmp_path, size):
 
 def test_frames_that_claim_to_be_huge_are_refused(fit, tmp_path):
     path = fit(small()).save(tmp_path / "scene.fiberburst")
-    rewritten(path, lambda model: replace(model, acquisition={**model.acquisition, "shape": (5, 10**6, 10**6, 1)}))
+    rewritten(path, partial(_taken, shape=(5, 10**6, 10**6, 1)))
     with pytest.raises(OutputError, match="268,435,456 values"):
+        load(path, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("scene_from_frame", 0), ("scene_from_frame", np.inf), ("control", np.inf), ("control_grid", 0)]
+)
+def test_frames_that_bend_without_sense_are_refused(bent, tmp_path, name, value):
+    path = bent.save(tmp_path / "bent.fiberburst")
+    whole = Model.load(path)
+    replace(whole, drawn_from={**whole.drawn_from, name: np.full_like(whole.drawn_from[name], value)}).save(path)
+    with pytest.raises(OutputError, match=r"bent\.fiberburst"):
         load(path, "cpu")
 
 

@@ -30,8 +30,8 @@ REPRESENTATION_ENDING = ".npz"
 PICTURE_ENDING = ".png"
 # Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
 _OME_UNITS = ("pm", "Å", "nm", "µm", "mm", "cm", "m", "in", "pixel")
-_SOFTWARE = "napari-fiberburst"
-_NAMED_PACKAGES = (_SOFTWARE, "numpy", "scipy", "torch", "scikit-image", "tifffile")
+SOFTWARE = "napari-fiberburst"
+_NAMED_PACKAGES = (SOFTWARE, "numpy", "scipy", "torch", "scikit-image", "tifffile")
 
 
 def check_output(path: str | Path, source: Path | None = None) -> Path:
@@ -248,7 +248,7 @@ def _is_ours(path: Path) -> bool:
         told = read_json(path)
     except OutputError:
         return False
-    return isinstance(told, dict) and told.get("software") == _SOFTWARE
+    return isinstance(told, dict) and told.get("software") == SOFTWARE
 
 
 def versions() -> dict[str, Any]:
@@ -259,4 +259,4 @@ def versions() -> dict[str, Any]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return {"software": _SOFTWARE, "versions": found}
+    return {"software": SOFTWARE, "versions": found}

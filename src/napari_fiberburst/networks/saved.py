@@ -12,7 +12,7 @@ from napari_fiberburst.data.burst import Acquisition, check_frame
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.device import find_device
 from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import is_model, read_representation
+from napari_fiberburst.io.results import SOFTWARE, is_model, read_representation
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.quality.resolution import RingCorrelation
 from napari_fiberburst.results.model import Model
@@ -80,10 +80,12 @@ def _restored(model: Model, device: torch.device) -> Reconstruction:
     """Return the result that a model holds."""
     renderer = _renderer(model.drawn_from, Settings.from_dict(model.settings).method, model.taken, device)
     result = model.result(renderer)
-    # A few pixels: contents that do not belong together fail now, and not when somebody draws them.
+    # A few pixels of each frame: contents that do not belong together fail now, and not when somebody draws them.
     field = Canvas.over((0, 0, *result.acquisition.shape[2:0:-1]), 2 / max(result.acquisition.shape[1:3]))
-    if np.isinf(draw(renderer, field, result.reference, result.acquisition)).any():
-        raise ValueError("what it draws is infinite")
+    for frame in range(result.acquisition.shape[0]):
+        renderer.displacement(field.points(), frame)
+        if np.isinf(draw(renderer, field, frame, result.acquisition)).any():
+            raise ValueError("what it draws is infinite")
     return result
 
 
@@ -120,7 +122,7 @@ def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device
         ending=provenance["ending"],
         acquisition=acquisition,
         renderer=renderer,
-        made_with={name: provenance[name] for name in ("software", "versions") if name in provenance},
+        made_with={"software": SOFTWARE, "versions": provenance.get("versions", {})},
         reference=reference,
         held_out_rmse=provenance.get("held_out_rmse"),
         frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),

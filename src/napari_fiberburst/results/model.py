@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_fiberburst.data.burst import Acquisition, check_frame
+from napari_fiberburst.data.burst import Acquisition, check_acquisition
 from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.io.results import MODEL_ENDING
+from napari_fiberburst.io.results import MODEL_ENDING, SOFTWARE
 from napari_fiberburst.results.diagnostics import Diagnostics, Ending, Quality
 from napari_fiberburst.settings import Settings
 from napari_fiberburst.stored import Arrays, Stored
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # What a result and its file have under one name.
 _ALIKE = ("image", "canvas", "homographies", "losses", "seconds", "parameters", "device", "ending", "made_with")
+# No canvas reaches so many pixels from the reference frame.
+_FAR = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,12 +96,8 @@ class Model(Stored):
 
     def _check(self) -> None:
         """Refuse contents that do not belong together."""
-        frames, height, width, channels = (int(side) for side in self.taken.shape)
-        if min(frames, height, width, channels) < 1:
-            raise ValueError(f"there is no burst of shape {self.taken.shape}")
-        check_frame(height, width, channels)
-        if self.taken.axes not in ("TYX", "TYXC") or (self.taken.axes == "TYX" and channels > 1):
-            raise ValueError(f"frames of axes {self.taken.axes!r} cannot have {channels} channels")
+        check_acquisition(self.taken)
+        frames, height, width, channels = self.taken.shape
         shape = self.canvas.shape
         known: list[tuple[str, Any, str, tuple[int | None, ...]]] = [
             ("image", self.image, "float32", shape if self.taken.axes == "TYX" else (*shape, channels)),
@@ -110,8 +108,7 @@ class Model(Stored):
         ]
         for name, array, dtype, wanted in known:
             _check_array(name, array, dtype, wanted)
-        if not np.isfinite(self.canvas.reference_from_image).all():
-            raise ValueError("the canvas lies nowhere")
+        _check_canvas(self.canvas.reference_from_image)
         bundle, told = self.diagnostics.bundle, self.diagnostics
         if bundle is not None:
             bundle._check()
@@ -119,12 +116,15 @@ class Model(Stored):
                 raise ValueError(f"the bundle of shape {bundle.shape} is not that of frames of {height} x {width}")
         if not 0 <= told.reference < frames or not set(told.frames_used or ()) <= set(range(frames)):
             raise ValueError(f"a burst of {frames} frames cannot have used {told.frames_used} of {told.reference}")
+        if not np.isfinite(self.homographies[told.reference]).all():
+            raise ValueError(f"frame {told.reference}, the reference, lies nowhere")
         if self.ending not in get_args(Ending) or told.quality not in (*get_args(Quality), None):
             raise ValueError(f"no run ends as {self.ending!r} with a verdict of {told.quality!r}")
         if not all(isinstance(note, str) for note in told.notes):
             raise ValueError("notes must be text")
-        if not isinstance(self.made_with, Mapping):
-            raise TypeError("what it was made with must be a mapping")
+        versions = self.made_with["versions"]
+        if self.made_with.get("software") != SOFTWARE or not all(isinstance(one, str) for one in versions.values()):
+            raise ValueError(f"it was made with {self.made_with}, which is not {SOFTWARE} in a version")
         for name in ("seconds", "parameters"):
             float(getattr(self, name))
 
@@ -154,6 +154,16 @@ class Model(Stored):
 def compression(parameters: int, acquisition: Acquisition) -> float:
     """Return 1 - bytes of the parameters as float32 / bytes of the burst as it came; below 0 they take more room."""
     return 1 - 4 * parameters / acquisition.nbytes
+
+
+def _check_canvas(reference_from_image: NDArray[np.float64]) -> None:
+    step_x, step_y = np.diag(reference_from_image)[:2]
+    first = reference_from_image[:2, 2]
+    expected = np.array([[step_x, 0, first[0]], [0, step_y, first[1]], [0, 0, 1]])
+    if not (
+        np.array_equal(reference_from_image, expected) and 0 < min(step_x, step_y) and np.abs(expected).max() < _FAR
+    ):
+        raise ValueError(f"no canvas lies at {reference_from_image.tolist()}")
 
 
 def _check_array(name: str, array: Any, dtype: str, wanted: tuple[int | None, ...]) -> None:

@@ -132,8 +132,12 @@ class SplineImage:
                 raise ValueError(f"{name} is {arrays[name].dtype} of {arrays[name].shape}, expected {dtype} of {shape}")
         if not (0 < spacing < np.inf and np.isfinite(arrays["nodes"]).all()):
             raise ValueError(f"nodes {spacing} px apart from ({x0}, {y0}) on are no scene")
-        if not np.isfinite(arrays["homographies"]).any():
+        used = np.isfinite(arrays["homographies"]).all(axis=(1, 2))
+        if not used.any():
             raise ValueError("no frame takes part")
+        for name in {"scene_from_frame", "control"} & set(arrays):
+            if not np.isfinite(arrays[name][used]).all():
+                raise ValueError(f"{name} of frames that take part is not finite")
         return cls(
             scene=torch.from_numpy(arrays["scene"]).to(device),
             grid=Grid(x0, y0, spacing, (rows, columns)),
