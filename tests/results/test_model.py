@@ -277,6 +277,9 @@ def _deep(depth):
         _told("reference", 7),
         _told("reference", -1),
         _told("notes", (1, 2)),
+        _told("misfit", "small"),
+        _with("seconds", float("nan")),
+        _with("homographies", np.zeros((5, 3, 3))),
         partial(_taken, shape=(10**12, 43, 51, 1)),
         partial(_taken, shape=(5, 10**9, 10**9, 1)),
         *(

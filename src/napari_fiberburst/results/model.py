@@ -116,8 +116,9 @@ class Model(Stored):
                 raise ValueError(f"the bundle of shape {bundle.shape} is not that of frames of {height} x {width}")
         if not 0 <= told.reference < frames or not set(told.frames_used or ()) <= set(range(frames)):
             raise ValueError(f"a burst of {frames} frames cannot have used {told.frames_used} of {told.reference}")
-        if not np.isfinite(self.homographies[told.reference]).all():
-            raise ValueError(f"frame {told.reference}, the reference, lies nowhere")
+        is_known: NDArray[np.bool_] = np.isfinite(self.homographies).all(axis=(1, 2))
+        if not is_known[told.reference] or not np.linalg.det(self.homographies[is_known]).all():
+            raise ValueError(f"frame {told.reference}, the reference, lies nowhere, or another frame has no size")
         if self.ending not in get_args(Ending) or told.quality not in (*get_args(Quality), None):
             raise ValueError(f"no run ends as {self.ending!r} with a verdict of {told.quality!r}")
         if not all(isinstance(note, str) for note in told.notes):
@@ -125,8 +126,11 @@ class Model(Stored):
         versions = self.made_with["versions"]
         if self.made_with.get("software") != SOFTWARE or not all(isinstance(one, str) for one in versions.values()):
             raise ValueError(f"it was made with {self.made_with}, which is not {SOFTWARE} in a version")
-        for name in ("seconds", "parameters"):
-            float(getattr(self, name))
+        numbers = (self.seconds, self.parameters, told.misfit, told.held_out_rmse, told.resolution)
+        if not all(one is None or isinstance(one, int | float) for one in numbers) or not 0 <= self.seconds < np.inf:
+            raise ValueError(f"expected numbers, and seconds of a run; got {numbers}")
+        if not isinstance(self.parameters, int) or not 0 <= self.parameters < 2**63:
+            raise ValueError(f"no scene has {self.parameters} parameters")
 
     def _evidence(self, shape: tuple[int, int], frames: int) -> list[tuple[str, Any, str, tuple[int | None, ...]]]:
         """Return name, array, type and shape of what is known beside the image."""
