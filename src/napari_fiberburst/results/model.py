@@ -116,9 +116,14 @@ class Model(Stored):
                 raise ValueError(f"the bundle of shape {bundle.shape} is not that of frames of {height} x {width}")
         if not 0 <= told.reference < frames or not set(told.frames_used or ()) <= set(range(frames)):
             raise ValueError(f"a burst of {frames} frames cannot have used {told.frames_used} of {told.reference}")
-        is_known: NDArray[np.bool_] = np.isfinite(self.homographies).all(axis=(1, 2))
+        is_known = np.array([np.isfinite(one).all() for one in self.homographies])
         if not is_known[told.reference] or not np.linalg.det(self.homographies[is_known]).all():
             raise ValueError(f"frame {told.reference}, the reference, lies nowhere, or another frame has no size")
+        self._check_words()
+
+    def _check_words(self) -> None:
+        """Refuse plain values that no run has."""
+        told = self.diagnostics
         if self.ending not in get_args(Ending) or told.quality not in (*get_args(Quality), None):
             raise ValueError(f"no run ends as {self.ending!r} with a verdict of {told.quality!r}")
         if not all(isinstance(note, str) for note in told.notes):
