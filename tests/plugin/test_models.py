@@ -91,6 +91,8 @@ def test_a_model_that_is_dropped_on_the_window_opens(make_napari_viewer, npe2pm,
         assert layer.metadata["fiberburst"]["quality"] == result.quality
     viewer.dims.set_current_step(0, 3)
     np.testing.assert_array_equal(viewer.layers[0].data, result.image)
+    (saved,) = viewer.layers[0].save(str(tmp_path / "again.fiberburst"))
+    np.testing.assert_array_equal(load(saved, "cpu").coverage, result.coverage)
 
 
 @pytest.mark.parametrize("channels", [2, 3])
