@@ -5,7 +5,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin peers docs docs-images docs-results screenshots clean
+.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin soak peers docs docs-images docs-results screenshots clean
 
 demo: .venv/base
 	mkdir -p demo
@@ -45,6 +45,10 @@ bench-code: .venv/bench
 	$(BIN)/python benchmarks/memory.py
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python -m benchmarks.speed
+
+# What is promised of files, memory, processes and faults, tried for long; under 15 minutes on two cores.
+soak: .venv/soak
+	OMP_NUM_THREADS=1 $(BIN)/python -m soak $(MORE)
 
 # PyFibreBundle, away from napari: its OpenCV brings another Qt.
 peers: .venv-peers/made
@@ -92,6 +96,10 @@ clean:
 
 .venv/docs: pyproject.toml constraints.txt | .venv/pip
 	$(PIP) --editable . --group docs
+	@touch $@
+
+.venv/soak: pyproject.toml constraints.txt | .venv/pip
+	$(PIP) --editable . --group soak
 	@touch $@
 
 .venv-peers/made:

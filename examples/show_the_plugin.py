@@ -5,7 +5,9 @@
 Without a display, put `xvfb-run -s "-screen 0 1280x800x24"` in front.
 """
 
+import contextlib
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,25 @@ from PIL import Image
 from qtpy.QtCore import QEventLoop, QTimer
 
 from napari_fiberburst.plugin.contributions import make_sample
+from napari_fiberburst.plugin.recordings import recording_layer
 from napari_fiberburst.plugin.tasks.bundle import BundleTask
+from napari_fiberburst.plugin.tasks.mosaic import MosaicTask
+from napari_fiberburst.plugin.tasks.video import VideoTask
+from napari_fiberburst.simulation import simulate_recording
 
 WIDTH, HEIGHT, QUALITY = 1280, 800, 85
 # Frames that move as long as they are exposed: detail along the motion is lost.
 SMEARED = {"smear": 1.0}
+# Of a hand that wanders; and for how long a camera is looked at.
+RECORDING: dict[str, Any] = {
+    "path": "handheld",
+    "frames": 120,
+    "shape": (200, 200),
+    "turn": 2.0,
+    "pitch": 4.0,
+    "seed": 4,
+}
+SECONDS_LIVE = 8
 
 
 def wait(until: Callable[[], bool], seconds: float = 120) -> None:
@@ -55,8 +71,39 @@ class States:
         self.viewer.window.resize(WIDTH, HEIGHT)
         _, self.dock = self.viewer.window.add_plugin_dock_widget("napari-fiberburst", "Fiber burst reconstruction")
 
-    def show_all(self) -> None:
-        """Go through all states."""
+    def show_live(self) -> None:
+        """Go from the empty dock to the live view."""
+        self.dock.empty.live_button.click()
+        live = self.dock.live
+        live.mosaic.setChecked(True)
+        live.start()
+        wait(lambda: live.words.text() == "Good")
+        rest(SECONDS_LIVE)
+        self.take("live")
+        live.stop()
+        wait(lambda: live.job is None)
+        self.viewer.close()
+
+    def show_recording(self) -> None:
+        """Make a mosaic of a recording, with the task *Video* before it."""
+        recording = simulate_recording(**RECORDING)
+        frames, look, _ = recording_layer(recording.source, "recording")
+        self.viewer.add_image(frames, **look)
+        self.dock.choose_task(VideoTask)
+        self.dock.task.output.edit.setText("recording-video.ome.zarr")
+        self.take("video")
+        self.dock.choose_task(MosaicTask)
+        task = self.dock.task
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            task.output.edit.setText("recording-mosaic.ome.zarr")
+            task.start_button.click()
+            wait(lambda: bool(task.words.text()) or task.job is None)
+            self.viewer.reset_view()
+            self.take("mosaic")
+            self.viewer.close()
+
+    def show_picture(self) -> None:
+        """Go through all states of the tasks *Picture* and *Bundle*."""
         picture = self.dock.picture
         self.take("empty")
         self.open()
@@ -85,7 +132,7 @@ class States:
         self.run_until(lambda: picture.runner.state == "ready")
         self.take("doubtful")
         self.dock.input.bundle.value = self.viewer.add_image(
-            np.random.default_rng(0).normal(100, 5, (256, 256)), name="no bundle", visible=False
+            np.random.default_rng(0).normal(100, 5, (256, 256)), name="image of the bundle", visible=False
         )
         self.run_until(lambda: picture.runner.state == "ready")
         self.take("failed")
@@ -114,9 +161,12 @@ class States:
 
 def main(folder: Path) -> None:
     """Write a picture of each state in each theme."""
+    folder = folder.absolute()
     folder.mkdir(parents=True, exist_ok=True)
     for theme in ("dark", "light"):
-        States(folder, theme).show_all()
+        States(folder, theme).show_picture()
+        States(folder, theme).show_recording()
+        States(folder, theme).show_live()
 
 
 if __name__ == "__main__":

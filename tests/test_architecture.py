@@ -34,6 +34,7 @@ ALLOWED = {
     "live": BASE | {"io", "simulation", "operators", "steps", "bundle", "motion", "pipeline"},
     "report": RESULTS | {"coordinates", "quality"},
     "cli": RESULTS | {"simulation", "quality", "bundle", "networks", "pipeline", "recordings", "report", "live", ""},
+    "__main__": {"cli"},
     "memory": BASE,
     "streaming": set(),
     "plugin": RESULTS

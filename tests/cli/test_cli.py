@@ -16,6 +16,8 @@ import tifffile
 from PIL import Image
 from tqdm import tqdm
 
+from napari_fiberburst import __version__
+from napari_fiberburst.__main__ import main as command_line
 from napari_fiberburst.cli import demo, main, reconstruct
 from napari_fiberburst.simulation import Faults, simulate, simulate_recording
 
@@ -193,9 +195,10 @@ def test_reconstruct_writes_a_picture_for_a_quick_look(burst_file, tmp_path):
 def test_no_loss_is_shown_before_there_is_one(burst_file, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(reconstruct, "tqdm", partial(tqdm, mininterval=0))
     assert main(["reconstruct", str(burst_file), "-o", str(tmp_path / "a.png"), "--device", "cpu"]) == 0
-    shown = capsys.readouterr().err
-    assert "loss=" in shown
-    assert "nan" not in shown
+    told = capsys.readouterr()
+    assert "loss=" in told.err
+    assert "nan" not in told.err
+    assert "finest detail" in told.out
 
 
 def test_reconstruct_can_write_the_networks(burst_file, tmp_path):
@@ -343,3 +346,19 @@ def test_the_demo_refuses_a_place_it_cannot_write(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path / "none" / "demo.png")]) == 2
     assert main(["demo", "-o", str(tmp_path / "demo.gif")]) == 2
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_the_command_is_imported_is_a_line(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("napari_fiberburst.cli.main", interrupted)
+    assert command_line() == 130
+    assert capsys.readouterr().err == "\nfiberburst: interrupted; nothing was written\n"
+
+
+def test_the_package_is_the_command():
+    done = subprocess.run(
+        [sys.executable, "-m", "napari_fiberburst", "--version"], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stdout.split()[-1]) == (0, __version__)

@@ -116,6 +116,12 @@ def test_a_crop_outside_the_image_is_refused(rng, rows):
         Burst(stack(rng, (3, 40, 50))).crop(rows, (0, 50))
 
 
+@pytest.mark.parametrize(("black", "white"), [(-1e98, 0), (0, 1e40), (-1e-60, 0), (7, 7 + 1e-60)])
+def test_levels_that_float32_does_not_tell_apart_are_refused(rng, black, white):
+    with pytest.raises(BurstError, match=r"below the white level, both between -3e38 and 3e38"):
+        Burst(stack(rng), black_level=black, white_level=white)
+
+
 def test_a_crop_too_small_is_refused(rng):
     with pytest.raises(BurstError, match="at least 16 pixels"):
         Burst(stack(rng, (3, 40, 50))).crop((0, 15), (0, 50))

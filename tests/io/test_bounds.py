@@ -214,3 +214,14 @@ def test_a_zarr_with_a_pipe_in_it_is_refused(tmp_path, frames, name):
     os.mkfifo(path / name)
     with pytest.raises(BurstError, match="is a pipe or a device"):
         open_recording(path)
+
+
+def test_strips_that_were_never_written_are_not_taken_for_black(tmp_path, rng):
+    path = tmp_path / "sparse.tif"
+    frames = rng.integers(0, 255, (3, 41, 53), np.uint8)
+    tifffile.imwrite(path, frames, rowsperstrip=16, compression="zlib", photometric="minisblack")
+    with tifffile.TiffFile(path, mode="r+") as file:
+        counts = file.pages[1].tags["StripByteCounts"]
+        counts.overwrite((counts.value[0], 0, counts.value[2]))
+    with pytest.raises(BurstError, match="parts of it are missing; copy or export it again"):
+        read_burst(path)

@@ -32,6 +32,14 @@ def test_a_total_does_not_depend_on_threads(shape):
     assert float(first) == pytest.approx(math.fsum(values.flatten().tolist()), rel=1e-6)
 
 
+@pytest.mark.parametrize("shape", [(5, 1), (3, 4096), (2, 3, 9001), (211, 4099)])
+def test_sums_of_rows_do_not_depend_on_threads(shape):
+    values = torch.rand(shape, generator=torch.Generator().manual_seed(1))
+    first, *others = by_threads(lambda: steady.row_sums(values))
+    assert all(torch.equal(first, other) for other in others)
+    torch.testing.assert_close(first, values.double().sum(dim=-1).float())
+
+
 def test_means_are_means():
     values, weights = torch.rand(2, 91, 503, generator=torch.Generator().manual_seed(2))
     assert float(steady.mean(values)) == pytest.approx(float(values.double().mean()), rel=1e-6)

@@ -9,11 +9,13 @@ from napari.utils.notifications import notification_manager
 from npe2 import PluginManifest
 from qtpy.QtCore import QEvent, QPoint, Qt
 from qtpy.QtGui import QHelpEvent
-from qtpy.QtWidgets import QApplication, QFileDialog, QToolTip
+from qtpy.QtWidgets import QApplication, QFileDialog, QPushButton, QToolTip
 from skimage.io import imread
+from superqt import QCollapsible
 
 from napari_fiberburst.plugin import commands
 from napari_fiberburst.plugin.tasks.bundle import BundleTask
+from napari_fiberburst.plugin.tasks.live import LiveTask
 
 MILLISECONDS = 60_000
 
@@ -92,14 +94,72 @@ def test_start_opens_the_dock_and_the_others_say_that_it_is_closed(make_napari_v
     assert len(viewer.window.dock_widgets) == 1
 
 
-def test_every_command_is_in_the_manifest_and_has_a_key_that_napari_can_change(open_dock):
+def test_every_command_is_in_the_palette_and_among_the_keys_that_napari_can_change(open_dock):
     manifest = PluginManifest.from_distribution("napari-fiberburst")
-    titles = {command.id.partition(".")[2]: command.title for command in manifest.contributions.commands}
+    inside = "napari_fiberburst.plugin.commands:"
+    offered = {
+        command.id: command.title
+        for command in manifest.contributions.commands
+        if command.python_name.startswith(inside) and callable(getattr(commands, command.python_name[len(inside) :]))
+    }
     open_dock()
-    for name, command in commands.COMMANDS.items():
-        assert titles[name] == command.title
+    titles = {name: command.title for name, command in commands.COMMANDS.items()} | {"film": commands.FILM_TITLE}
+    assert offered == {f"napari-fiberburst.{name}": title for name, title in titles.items()}
+    for name, title in titles.items():
+        action = action_manager._actions[f"napari-fiberburst:{name}"]
+        assert (action.description, action.keymapprovider) == (title, ViewerModel)
+    for command in commands.COMMANDS.values():
         if command.key is not None:
             assert coerce_keybinding(command.key) in ViewerModel.class_keymap
+
+
+def test_every_button_has_a_command_but_for_those_that_fold_and_choose_a_place(open_dock):
+    _, dock = open_dock()
+    empty, compare = dock.empty, dock.picture.runs.compare
+    # One has a menu; the space bar presses one; and two do what a command does to what is chosen elsewhere.
+    others = {empty.sample_button, compare.flip, empty.open_button, dock.tasks[1].film_button}
+    others |= {box.toggleButton() for box in dock.findChildren(QCollapsible)}
+    commanded = set(commands.KeyHints(dock).widgets)
+    without = [
+        button.text()
+        for button in dock.findChildren(QPushButton)
+        if button.text() != "…" and button not in others | commanded
+    ]
+    assert not without
+
+
+def test_what_there_is_nothing_for_is_said_and_does_nothing(open_dock, burst_layer):
+    _, dock = open_dock(burst_layer)
+    names = (
+        "best_frames",
+        "motion",
+        "keep_bundle",
+        "keep_burst",
+        "leave_out",
+        "as_chosen",
+        "remove_runs",
+        "undo_remove",
+    )
+    for name in (*names, "continue_run", "shown_frames"):
+        commands.press(name)
+        assert notification_manager.records[-1].message.startswith(f"{commands.COMMANDS[name].title}: not now.")
+    assert dock.picture.is_empty
+
+
+def test_runs_are_removed_and_brought_back_by_commands(open_dock, burst_layer, run_through):
+    _, dock = open_dock(burst_layer)
+    run = run_through(dock)
+    commands.remove_runs()
+    assert not dock.picture.runs.runs
+    commands.undo_remove()
+    assert dock.picture.runs.runs == (run,)
+
+
+def test_the_live_view_opens_by_its_command_in_a_dock_that_was_closed(make_napari_viewer, npe2pm):
+    npe2pm.register(PluginManifest.from_distribution("napari-fiberburst"))
+    viewer = make_napari_viewer()
+    commands.show_live()
+    assert isinstance(commands.find_dock(viewer).task, LiveTask)
 
 
 @pytest.mark.parametrize(("chosen", "told"), [(None, "Ctrl+↵"), (["Alt-Q"], "Alt+Q")])

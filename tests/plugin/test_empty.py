@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from napari.layers import Image
+from napari.utils.notifications import notification_manager
 from npe2 import PluginManifest
 from qtpy.QtWidgets import QFileDialog
 from skimage.io import imsave
@@ -80,6 +82,27 @@ def test_a_file_that_is_no_burst_is_refused_in_words(open_dock, qtbot, tmp_path)
     assert not dock.empty.words.text().startswith("Opening")
     assert is_empty(dock)
     assert not viewer.layers
+
+
+def test_another_burst_is_opened_beside_the_one_that_is_chosen_and_takes_its_place(
+    open_dock, qtbot, monkeypatch, files, tmp_path, grey_frames
+):
+    path, frames = files["tif"]
+    viewer, dock = open_dock(Image(grey_frames, name="first"))
+    chosen = str(path)
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_: (chosen, ""))
+    dock.input.burst_button.click()
+    assert not dock.input.burst_button.isEnabled()
+    qtbot.waitUntil(lambda: len(viewer.layers) == 2, timeout=MILLISECONDS)
+    assert dock.input.burst.value is viewer.layers[1]
+    assert dock.input.source().shape[0] == frames
+    broken = tmp_path / "broken.tif"
+    broken.write_bytes(b"no TIFF")
+    chosen = str(broken)
+    dock.input.burst_button.click()
+    qtbot.waitUntil(dock.input.burst_button.isEnabled, timeout=MILLISECONDS)
+    assert "broken.tif" in notification_manager.records[-1].message
+    assert dock.input.burst.value is viewer.layers[1]
 
 
 def test_every_sample_is_offered_and_the_one_chosen_is_simulated(open_dock, qtbot, npe2pm):

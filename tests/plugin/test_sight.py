@@ -88,8 +88,10 @@ def test_a_result_a_doubtful_one_and_a_comparison_are_seen_whole(window, burst, 
     _, dock = window(burst)
     picture = dock.picture
     picture.form.set_choices(QUICK)
+    width = dock.width()
     run_through(dock)
     assert_seen(qtbot, dock, *way(dock), picture.runs.compare)
+    assert dock.width() == width
     run = run_through(dock)
     run.result = replace(run.result, quality="doubtful", notes=NOTES)
     picture.display.card.refresh()
@@ -109,6 +111,7 @@ def test_why_a_run_failed_is_seen_whole(window, burst, qtbot):
     picture = dock.picture
     picture.form.set_choices(QUICK)
     picture.display.fail(
-        "the bundle has no cores that could be told apart in these frames; take an image of the bundle in even light"
+        "run 1",
+        "the bundle has no cores that could be told apart in these frames; take an image of the bundle in even light",
     )
     assert_seen(qtbot, dock, picture.start_button, picture.display.status, picture.departures)

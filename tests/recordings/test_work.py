@@ -1,8 +1,10 @@
 """Units of work: done once, gone on with, and refused where something else is there."""
 
 import errno
+import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from tests.recordings.same import assert_same
@@ -10,7 +12,8 @@ from tests.recordings.same import assert_same
 from napari_fiberburst.errors import BurstError, OutputError
 from napari_fiberburst.io import open_recording
 from napari_fiberburst.recordings.mosaic import mosaic
-from napari_fiberburst.recordings.work import claim, complete, discard, finish, is_begun, own
+from napari_fiberburst.recordings.outputs import is_beside
+from napari_fiberburst.recordings.work import _handed, _taken, claim, complete, discard, finish, is_begun, own
 
 
 def note(work, stage, number):
@@ -99,8 +102,37 @@ def test_what_others_have_written_is_neither_replaced_nor_removed(tmp_path):
     own(folder, [mine])
     with pytest.raises(OutputError, match=r"m-2\.ome\.zarr is there already"):
         own(folder, [mine, theirs])
-    discard(folder)
+    discard(folder, lambda path: is_beside(mine, path))
     assert sorted(tmp_path.iterdir()) == [theirs]
+
+
+def test_beginning_anew_removes_nothing_else_whatever_a_folder_says(tmp_path):
+    folder, output = tmp_path / "m.work", tmp_path / "m.ome.zarr"
+    kept = [
+        tmp_path / "thesis.txt",
+        tmp_path / "m.txt",
+        tmp_path / "elsewhere" / "m.ome.zarr",
+        tmp_path / "n.poses.csv",
+    ]
+    gone = [tmp_path / name for name in ("m.poses.csv", "m-3.ome.zarr", "m.traces.csv")]
+    claim(folder, {})
+    (tmp_path / "elsewhere").mkdir()
+    for path in [*kept, *gone]:
+        path.write_text("mine")
+    (folder / "outputs.json").write_text(json.dumps([str(path) for path in [*kept, *gone, output]]))
+    discard(folder, lambda path: is_beside(output, path))
+    assert all(path.exists() for path in kept)
+    assert not any(path.exists() for path in gone)
+    assert not is_begun(folder)
+
+
+def test_what_a_worker_is_handed_is_taken_only_as_it_was_written(work):
+    handed = _handed(work)
+    assert _taken(handed).folder == work.folder
+    Path(handed).write_bytes(Path(handed).read_bytes()[:-1] + b"?")
+    _taken.cache_clear()
+    with pytest.raises(OutputError, match="was altered since this run wrote it"):
+        _taken(handed)
 
 
 def test_a_finished_mosaic_is_not_replaced(clip, unbroken):

@@ -188,7 +188,7 @@ class _Patterns:
 
     def moved_back(self, offsets: Tensor) -> Tensor:
         """Return the spectra of images whose bundles were `offsets` (T, 2) away, moved to where these are 0."""
-        return steady.complex_product(self.spectra, _waves(offsets @ self.frequencies.T))
+        return steady.complex_product(self.spectra, self._waves(offsets))
 
     def others(self, offsets: Tensor) -> Tensor:
         """Return for each image the sum of all others, moved back."""
@@ -213,7 +213,7 @@ class _Patterns:
         # Half a pixel apart, because where cores are three pixels apart, the peak is narrower than a pixel.
         between = torch.tensor([[x, y] for y in (0.0, 0.5) for x in (0.0, 0.5)]).to(self.frequencies)
         spectra = torch.zeros(len(between), *self.band.shape, dtype=mean.dtype, device=mean.device)
-        spectra[:, self.band] = steady.complex_product(product, _waves(between @ self.frequencies.T))
+        spectra[:, self.band] = steady.complex_product(product, self._waves(between))
         correlations = steady.irfft2(spectra, self.shape).roll((MOST_OFFSET, MOST_OFFSET), (1, 2))
         near = correlations[:, : 2 * MOST_OFFSET + 1, : 2 * MOST_OFFSET + 1]
         which, row, column = np.unravel_index(int(near.argmax()), near.shape)
@@ -224,13 +224,20 @@ class _Patterns:
         """Return where the frames' bundles are relative to those of mean spectra (T, K), near `offsets` (T, 2)."""
         return self._climbed(steady.complex_product(self.spectra, means.conj()), offsets)
 
+    def _waves(self, offsets: Tensor) -> Tensor:
+        """Return what moves spectra by offsets (T, 2): (T, K), of absolute value 1."""
+        # A product of matrices is rounded as threads divide it.
+        phase = offsets[:, :1] * self.frequencies[:, 0] + offsets[:, 1:] * self.frequencies[:, 1]
+        return torch.polar(torch.ones_like(phase), phase)
+
     def _climbed(self, products: Tensor, offsets: Tensor) -> Tensor:
         """Climb correlations, of which (T, K) are the spectra, by Newton's steps from `offsets` (T, 2)."""
         x, y = self.frequencies.T
-        second = torch.stack([x * x, x * y, x * y, y * y], dim=1)
+        first, second = torch.stack([x, y]), torch.stack([x * x, x * y, x * y, y * y])
         for _ in range(_STEPS):
-            waves = steady.complex_product(products, _waves(offsets @ self.frequencies.T))
-            slope, curvature = -waves.imag @ self.frequencies, (waves.real @ second).reshape(-1, 2, 2)
+            waves = steady.complex_product(products, self._waves(offsets))
+            slope = -steady.row_sums(waves.imag[:, None] * first)
+            curvature = steady.row_sums(waves.real[:, None] * second).reshape(-1, 2, 2)
             # Beside a peak there may be none in reach: then it is better to stay.
             is_peak = (torch.linalg.det(curvature) > 0) & (curvature[:, 0, 0] > 0)
             safe = torch.where(is_peak[:, None, None], curvature, torch.eye(2).to(curvature))
@@ -253,10 +260,6 @@ def _at_rest(frame: Tensor, x: float, y: float) -> Tensor:
     pixels: NDArray[np.float32] = frame.cpu().numpy()
     moved = [shift(band, (-y, -x), order=_SPLINE_ORDER, mode="nearest") for band in np.moveaxis(pixels, 2, 0)]
     return torch.from_numpy(np.stack(moved, axis=2)).to(frame).clamp(0, 1)
-
-
-def _waves(phase: Tensor) -> Tensor:
-    return torch.polar(torch.ones_like(phase), phase)
 
 
 def _pitch(grey: Tensor) -> float | None:

@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
     )
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
     if found.resolution is not None:
-        print(f"two halves of the frames agree down to periods of {found.resolution:.1f} pixels")
+        print(f"finest detail {found.resolution:.1f} px: down to it, two halves of the frames agree")
     reasons = f": {'; '.join(found.notes)}" if found.notes else ""
     print(f"the mosaic is {found.quality}{reasons}")
     print(f"wrote {' and '.join(map(str, (*found.paths, found.poses)))}")

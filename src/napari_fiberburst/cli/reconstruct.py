@@ -122,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
     if result.held_out_rmse is not None:
         print(f"samples left out are met to {result.held_out_rmse:.3g} intensity units")
     if result.resolution is not None:
-        print(f"two halves of the burst agree down to periods of {result.resolution:.1f} pixels")
+        print(f"finest detail {result.resolution:.1f} px: down to it, two halves of the burst agree")
     if result.compression > 0:
         print(f"{result.parameters} parameters stand for the burst in {1 - result.compression:.1%} of its bytes")
     if result.quality is not None:

@@ -51,14 +51,14 @@ def clear(options: argparse.Namespace) -> None:
         What would be replaced is the recording, or no picture of ours.
     """
     from napari_fiberburst.recordings.movie import check_movie
-    from napari_fiberburst.recordings.outputs import ENDING, outputs_of, work_of
+    from napari_fiberburst.recordings.outputs import ENDING, is_beside, outputs_of, work_of
     from napari_fiberburst.recordings.work import discard, is_begun, remove
 
     output, folder = options.output.resolve(), work_of(options.output.resolve())
     film = getattr(options, "mp4", None)
     keep_input(options.input, output, *([] if film is None else [film]))
     if not options.resume:
-        discard(folder)
+        discard(folder, lambda path: is_beside(output, path) or (film is not None and path == film.resolve()))
     if options.overwrite and not is_begun(folder) and output.exists():
         if not output.name.endswith(ENDING) or not (output / "zarr.json").exists():
             raise OutputError(f"{output} is no OME-Zarr, and would be lost; choose another name, or remove it")

@@ -140,7 +140,8 @@ class Burst(Acquisition):
         dtype = np.dtype(stack.dtype)
         black, white = choose_levels(dtype, float(values.min()), float(values.max()), black_level, white_level)
         values -= np.float32(black)
-        values /= np.float32(white - black)
+        with np.errstate(over="ignore"):  # far above a white level that is tiny
+            values /= np.float32(white - black)
         np.clip(values, 0, 1, out=values)
         _check_contents(values)
         super().__init__(
@@ -315,8 +316,12 @@ def choose_levels(
         white = full if white is None else float(white)
     except (TypeError, ValueError) as error:
         raise BurstError(f"black and white level must be numbers; got {black!r} and {white!r}") from error
-    if not (np.isfinite(black) and np.isfinite(white) and black < white):
-        raise BurstError(f"the black level must be finite and below the white level; got {black:g} and {white:g}")
+    with np.errstate(over="ignore"):  # frames are float32, in which the levels must differ, too
+        span, lowest = np.float32(white - black), np.float32(black)
+    if not (np.isfinite(span) and np.isfinite(lowest) and span > 0):
+        raise BurstError(
+            f"the black level must be below the white level, both between -3e38 and 3e38; got {black:g} and {white:g}"
+        )
     return black, white
 
 

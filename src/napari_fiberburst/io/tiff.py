@@ -143,6 +143,8 @@ def _lacks_pixels(path: Path, series: tifffile.TiffPageSeries) -> bool:
     for page in series.pages:
         if page is None or _end_of(page) > page.parent.filehandle.size:
             return True
+        if 0 in page.databytecounts:  # a strip or tile that was never written, and would be black
+            return True
         stored += sum(page.databytecounts)
     check_packed(path, series.nbytes, stored)
     return False

@@ -1,8 +1,9 @@
 """Arithmetic whose bits do not depend on the number of threads.
 
 Torch gives every thread a part of a large sum, so that how it rounds depends on how many there are. Here elements are
-added in blocks of one size, each by one thread, and the blocks' sums likewise. Nor does it round a complex product
-alike at the ends of a thread's part and within it, or a batch of inverse transforms in one thread and in several.
+added in blocks of one size, each by one thread, and the blocks' sums likewise; a product of matrices with long rows is
+a sum, too. Nor does torch round a complex product alike at the ends of a thread's part and within it, or a batch of
+inverse transforms in one thread and in several.
 """
 
 import torch
@@ -20,6 +21,14 @@ def total(values: Tensor) -> Tensor:
         blocks, rest = flat[:whole].reshape(-1, _BLOCK).sum(dim=1), flat[whole:].sum()
         flat = torch.cat([blocks, rest[None]])
     return flat.sum()
+
+
+def row_sums(values: Tensor) -> Tensor:
+    """Return the sums (...) over the last axis of values (..., K)."""
+    while values.shape[-1] > _BLOCK:
+        padded = torch.nn.functional.pad(values, (0, -values.shape[-1] % _BLOCK))
+        values = padded.reshape(*values.shape[:-1], -1, _BLOCK).sum(dim=-1)
+    return values.sum(dim=-1)
 
 
 def mean(values: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from qtpy.QtWidgets import QAbstractButton, QToolTip, QWidget
 from napari_fiberburst.plugin.bursts import guess_axes
 from napari_fiberburst.plugin.contributions import PLUGIN
 from napari_fiberburst.plugin.film import ask_and_save
+from napari_fiberburst.plugin.tasks.bundle import BundleTask
 from napari_fiberburst.plugin.tasks.live import LiveTask
 from napari_fiberburst.plugin.tasks.long import LongTask
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.plugin.dock import FiberBurstWidget
 
 _WIDGET = "Fiber burst reconstruction"
+FILM_TITLE = "Save film…"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +48,15 @@ class Command:
         From the dock to the widget that does the same, whose tooltip tells the key.
     act : callable
         Does it, with that widget; presses a button by default.
+    may_open : bool
+        Whether the dock is opened for it, where it is closed.
     """
 
     title: str
-    key: str | None
+    key: str | None = None
     widget: Callable[[Any], QWidget]
     act: Callable[[Any], None] = QAbstractButton.click
+    may_open: bool = False
 
 
 def _going(dock: Any) -> Any:
@@ -59,9 +64,34 @@ def _going(dock: Any) -> Any:
     return dock.task if isinstance(dock.task, LongTask | LiveTask) else dock.picture
 
 
+def _keeper(dock: Any) -> Any:
+    """Return the button that keeps the bundle which is meant: the one that is chosen, or else that of the run."""
+    return dock.task.keep_button if isinstance(dock.task, BundleTask) else dock.picture.runs.save.bundle
+
+
 COMMANDS = {
+    "open": Command(
+        title="Open a burst or a recording in the dock", widget=lambda dock: dock.input.burst_button, may_open=True
+    ),
+    "open_folder": Command(
+        title="Open a folder of frames in the dock", widget=lambda dock: dock.empty.folder_button, may_open=True
+    ),
+    "open_bundle": Command(title="Open a bundle in the dock", widget=lambda dock: dock.input.open_button),
+    "live": Command(title="Show the live view", widget=lambda dock: dock.empty.live_button, may_open=True),
+    "best_frames": Command(
+        title="Take the best frames of the recording", widget=lambda dock: dock.input.frames.best_button
+    ),
+    "shown_frames": Command(
+        title="Take the frames about the one shown", widget=lambda dock: dock.input.frames.shown_button
+    ),
+    "defaults": Command(
+        title="Set all settings back to their defaults", widget=lambda dock: dock.picture.departures.back_button
+    ),
     "start": Command(
-        title="Start the task that is shown", key="Ctrl-Enter", widget=lambda dock: dock.task.start_button
+        title="Start the task that is shown",
+        key="Ctrl-Enter",
+        widget=lambda dock: dock.task.start_button,
+        may_open=True,
     ),
     "pause": Command(
         title="Pause the run, or continue it", key="Ctrl-Shift-H", widget=lambda dock: _going(dock).pause_button
@@ -71,10 +101,24 @@ COMMANDS = {
         title="Compare two images", key="Ctrl-Shift-B", widget=lambda dock: dock.picture.runs.compare.button
     ),
     "save": Command(title="Save the result", key="Ctrl-Shift-S", widget=lambda dock: dock.picture.runs.save.result),
-    "report": Command(title="Save the report", key=None, widget=lambda dock: dock.picture.display.card.report.button),
-    "figure": Command(
-        title="Save a figure", key=None, widget=lambda dock: dock.picture.display.card.report.figure_button
+    "motion": Command(title="Save the motion", widget=lambda dock: dock.picture.runs.save.motion),
+    "report": Command(title="Save the report", widget=lambda dock: dock.picture.display.card.report.button),
+    "figure": Command(title="Save a figure", widget=lambda dock: dock.picture.display.card.report.figure_button),
+    "keep_bundle": Command(title="Keep the bundle", widget=_keeper),
+    "keep_burst": Command(title="Keep what was live as a burst", widget=lambda dock: dock.live.keep_button),
+    "leave_out": Command(
+        title="Leave out the frame that is shown, or take it in again",
+        widget=lambda dock: dock.picture.display.card.steering.frame_button,
     ),
+    "as_chosen": Command(
+        title="Set the image back to what the run had come to",
+        widget=lambda dock: dock.picture.display.card.steering.back_button,
+    ),
+    "continue_run": Command(title="Take the run further", widget=lambda dock: dock.picture.runs.continue_button),
+    "remove_runs": Command(title="Remove the selected runs", widget=lambda dock: dock.picture.runs.remove_button),
+    "undo_remove": Command(title="Bring back removed runs", widget=lambda dock: dock.picture.runs.undo_button),
+    "copy_python": Command(title="Copy the call in Python", widget=lambda dock: dock.picture.copying.python),
+    "copy_command": Command(title="Copy the command line", widget=lambda dock: dock.picture.copying.command),
     "next_run": Command(
         title="Next run",
         key="Ctrl-Shift-Down",
@@ -105,11 +149,18 @@ class KeyHints(QObject):
         for task in dock.tasks:
             if isinstance(task, LongTask | LiveTask):
                 self._names |= {task.pause_button: ["pause"], task.stop_button: ["stop"]}
+            if isinstance(task, BundleTask):
+                self._names |= {task.keep_button: ["keep_bundle"]}
         for name, command in COMMANDS.items():
             names = self._names.setdefault(command.widget(dock), [])
             names.extend({name}.difference(names))
         for widget in self._names:
             widget.installEventFilter(self)
+
+    @property
+    def widgets(self) -> tuple[QObject, ...]:
+        """What has a key, or could have one."""
+        return tuple(self._names)
 
     def eventFilter(self, watched: QObject | None, event: QEvent | None) -> bool:
         """Show the tooltip with its keys."""
@@ -143,7 +194,7 @@ def press(name: str) -> None:
     import napari
 
     viewer = napari.current_viewer()
-    dock = None if viewer is None else find_dock(viewer, may_open=name == "start")
+    dock = None if viewer is None else find_dock(viewer, may_open=COMMANDS[name].may_open)
     if dock is None:
         show_info(f"{COMMANDS[name].title}: the dock is not open; take Plugins > {_WIDGET}")
         return
@@ -157,17 +208,20 @@ def press(name: str) -> None:
 start, pause, stop = partial(press, "start"), partial(press, "pause"), partial(press, "stop")
 compare, save = partial(press, "compare"), partial(press, "save")
 report, figure = partial(press, "report"), partial(press, "figure")
+open_burst, open_folder, open_bundle = (
+    partial(press, "open"),
+    partial(press, "open_folder"),
+    partial(press, "open_bundle"),
+)
+show_live = partial(press, "live")
+best_frames, shown_frames = partial(press, "best_frames"), partial(press, "shown_frames")
+defaults, motion = partial(press, "defaults"), partial(press, "motion")
+keep_bundle, keep_burst = partial(press, "keep_bundle"), partial(press, "keep_burst")
+leave_out, as_chosen = partial(press, "leave_out"), partial(press, "as_chosen")
+continue_run, remove_runs = partial(press, "continue_run"), partial(press, "remove_runs")
+undo_remove = partial(press, "undo_remove")
+copy_python, copy_command = partial(press, "copy_python"), partial(press, "copy_command")
 next_run, previous_run = partial(press, "next_run"), partial(press, "previous_run")
-
-
-def show_live() -> None:
-    """Open the dock at the live view."""
-    import napari
-
-    viewer = napari.current_viewer()
-    dock = None if viewer is None else find_dock(viewer, may_open=True)
-    if dock is not None:
-        dock.choose_task(LiveTask)
 
 
 def save_film() -> None:
@@ -188,6 +242,10 @@ def bind_keys() -> None:
         action_manager.register_action(_action(name), lambda viewer, name=name: press(name), command.title, ViewerModel)
         for key in chosen.get(_action(name), [] if command.key is None else [command.key]):
             action_manager.bind_shortcut(_action(name), key)
+    # Acts on the layer that is selected, and has no use for the dock.
+    action_manager.register_action(_action("film"), lambda viewer: save_film(), FILM_TITLE, ViewerModel)
+    for key in chosen.get(_action("film"), []):
+        action_manager.bind_shortcut(_action("film"), key)
 
 
 def _action(name: str) -> str:

@@ -28,7 +28,7 @@ _ENDINGS = {
     "time budget": "has used up its time",
     "diverged": "came to no numbers, and keeps its last good image",
 }
-_NOTHING_YET = "Choose a burst and press Start."
+_NOTHING_YET = "Press Start: everything sets itself."
 
 
 class Display(QObject):
@@ -102,9 +102,9 @@ class Display(QObject):
         self.card.refresh()
         self.complete.emit(run)
 
-    def fail(self, problem: str) -> None:
-        """Say why a run came to nothing."""
-        self.status.setText(f"The run failed: {problem}.")
+    def fail(self, name: str, problem: str) -> None:
+        """Say why a run of this name came to nothing."""
+        self.status.setText(f"{name} failed: {problem}.")
 
     def select(self, run: KeptRun | None) -> None:
         """Let card and history be those of a run, at its newest image.

@@ -58,6 +58,9 @@ class FiberBurstWidget(QWidget):
         self.input.changed.connect(self._show_or_invite)
         for task in self.tasks:
             task.kept_changed.connect(self._show_or_invite)
+        self.input.burst_button.clicked.connect(self.empty.ask_for_file)
+        self.empty.busy_changed.connect(self.input.burst_button.setDisabled)
+        self.empty.opened.connect(lambda layers: self._take_opened(layers[0]))
         self.empty.live_button.clicked.connect(lambda: self.choose_task(LiveTask))
         self.live.burst_kept.connect(self._take_kept)
         bind_keys()
@@ -114,10 +117,15 @@ class FiberBurstWidget(QWidget):
             self._was_docked = self.parent() is not None
         return super().event(event)
 
+    def _take_opened(self, layer: "Layer") -> None:
+        """Choose what has been opened as the burst."""
+        self.reset_choices()
+        if layer in self.input.burst.choices:
+            self.input.burst.value = layer
+
     def _take_kept(self, layer: "Layer") -> None:
         """Go on with frames that were kept of a live view."""
-        self.reset_choices()
-        self.input.burst.value = layer
+        self._take_opened(layer)
         self.choose_task(PictureTask)
 
     def _show_task(self, number: int) -> None:
@@ -149,7 +157,7 @@ class FiberBurstWidget(QWidget):
         column.setContentsMargins(0, 0, 0, 0)
         for widget in (self.task_bar, self.input, self.glance, *self.tasks):
             column.addWidget(widget)
-        scroll = Column(content)
+        scroll = Column(content, self.picture.runs)
         WheelFilter(scroll)
         order_tabs(content)
         around = QVBoxLayout(self)

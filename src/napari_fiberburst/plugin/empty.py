@@ -6,8 +6,9 @@ from typing import Any
 
 from napari.components import ViewerModel
 from napari.layers import Layer
+from napari.utils.notifications import show_error
 from npe2 import PluginManager
-from qtpy.QtCore import Qt
+from qtpy.QtCore import Qt, Signal
 from qtpy.QtWidgets import QFileDialog, QLabel, QMenu, QPushButton, QVBoxLayout, QWidget
 from superqt.utils import create_worker
 
@@ -42,6 +43,9 @@ class EmptyBox(QWidget):
         What to do, or why something could not be opened.
     """
 
+    opened = Signal(object)  # the Layers, which are in the viewer
+    busy_changed = Signal(bool)
+
     def __init__(self, viewer: ViewerModel, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._viewer = viewer
@@ -62,14 +66,15 @@ class EmptyBox(QWidget):
         column.addWidget(self.words)
         column.addLayout(row_of(self.open_button, self.folder_button))
         column.addLayout(row_of(self.sample_button, self.live_button))
-        self.open_button.clicked.connect(self._ask_for_file)
+        self.open_button.clicked.connect(self.ask_for_file)
         self.folder_button.clicked.connect(self._ask_for_folder)
 
     def open(self, path: str) -> None:
         """Open a burst as a layer, with what its file says of it; or say why not."""
         self._load(partial(read, path), f"Opening {path}")
 
-    def _ask_for_file(self) -> None:
+    def ask_for_file(self) -> None:
+        """Let the user choose a file, and open it."""
         path, _ = QFileDialog.getOpenFileName(
             self, "Open a burst or a recording", "", f"Bursts and recordings ({_FILES})"
         )
@@ -96,13 +101,19 @@ class EmptyBox(QWidget):
 
     def _take(self, opened: list[LayerData]) -> None:
         self._set_busy(is_busy=False, words=_INVITATION)
-        for data, look, kind in opened:
-            self._viewer.add_layer(Layer.create(data, look, kind))
+        layers = [Layer.create(data, look, kind) for data, look, kind in opened]
+        for layer in layers:
+            self._viewer.add_layer(layer)
+        self.opened.emit(layers)
 
     def _take_error(self, error: Exception) -> None:
-        self._set_busy(is_busy=False, words=why(error, "a burst could not be opened"))
+        problem = why(error, "a burst could not be opened")
+        self._set_busy(is_busy=False, words=problem)
+        if self.isHidden():  # there is a burst already
+            show_error(problem)
 
     def _set_busy(self, *, is_busy: bool, words: str) -> None:
         for button in (self.open_button, self.folder_button, self.sample_button):
             button.setEnabled(not is_busy)
         self.words.setText(words)
+        self.busy_changed.emit(is_busy)

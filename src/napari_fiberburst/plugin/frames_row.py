@@ -137,6 +137,8 @@ class FramesRow(QWidget):
 
     def _show(self) -> None:
         self.setVisible(self._is_wanted and self._whole is not None)
+        for button in (self.best_button, self.shown_button):  # keys press them where they are not seen
+            button.setEnabled(self._whole is not None)
 
     def _tell(self) -> None:
         self._asked = None

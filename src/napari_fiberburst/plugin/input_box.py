@@ -35,6 +35,8 @@ class InputBox(QWidget):
     ----------
     burst, bundle, region : LayerPicker
         Their `value` is the layer chosen, or None.
+    burst_button, open_button : QPushButton
+        Open another burst, which is for the dock to do, and a bundle.
     frames : FramesRow
         Which frames of a long recording are the burst.
     axes : QLineEdit
@@ -54,7 +56,7 @@ class InputBox(QWidget):
         self.region = LayerPicker(
             viewer, lambda layer: isinstance(layer, Shapes) and not is_result(layer), "whole frame"
         )
-        self.open_button = QPushButton("Open…")
+        self.burst_button, self.open_button = QPushButton("Open…"), QPushButton("Open…")
         self.frames = FramesRow(viewer)
         self.axes = QLineEdit()
         self.channels = QListWidget()
@@ -140,7 +142,7 @@ class InputBox(QWidget):
 
     def set_wanted(self, *, is_burst_wanted: bool, are_frames_wanted: bool) -> None:
         """Show what a task takes: a burst, some frames of it, or nothing but its bundle."""
-        self._first.setRowVisible(self.burst.native, are_frames_wanted)
+        self._first.setRowVisible(self._burst_row, are_frames_wanted)
         self.more.setVisible(are_frames_wanted)
         self.frames.set_wanted(is_wanted=is_burst_wanted)
 
@@ -148,7 +150,7 @@ class InputBox(QWidget):
         """Lock or unlock what a running fit has taken."""
         for picker in (self.burst, self.bundle, self.region):
             picker.enabled = is_enabled
-        for widget in (self.axes, self.open_button, self.channels, self.frames):
+        for widget in (self.axes, self.burst_button, self.open_button, self.channels, self.frames):
             widget.setEnabled(is_enabled)
 
     def _lay_out(self) -> None:
@@ -161,7 +163,10 @@ class InputBox(QWidget):
             "A bundle that was opened, or an image of the bundle with nothing but even light before it. Never needed, "
             "but with it one frame is a burst."
         )
+        self.burst_button.setToolTip("Open another burst or recording: a video, a TIFF stack, or a .burst file.")
         self.open_button.setToolTip("Open a bundle that was kept: a .bundle file.")
+        self.burst_button.setAccessibleName("open a burst")
+        self.open_button.setAccessibleName("open a bundle")
         self.region.tooltip = "A layer of shapes, whose selected or last rectangle limits the run: for a quick look."
         self.channels.setToolTip("Layers that are further channels of the same burst; same shape, one grey layer each.")
         for picker, name in ((self.burst, "burst"), (self.bundle, "bundle"), (self.region, "region")):
@@ -170,10 +175,13 @@ class InputBox(QWidget):
         self.channels.setAccessibleName("further channels")
         self.channels.setMaximumHeight(_LINES_OF_CHANNELS * self.fontMetrics().height() + 8)
         self._first = first = form_layout()
-        first.addRow("burst", self.burst.native)
-        bundle_row = row_of(self.bundle.native, self.open_button)
-        bundle_row.setStretch(0, 1)
-        first.addRow("bundle", bundle_row)
+        self._burst_row, bundle_row = (
+            row_of(picker.native, button)
+            for picker, button in ((self.burst, self.burst_button), (self.bundle, self.open_button))
+        )
+        for name, row in (("burst", self._burst_row), ("bundle", bundle_row)):
+            row.setStretch(0, 1)
+            first.addRow(name, row)
         self._rest = rest = form_layout()
         rest.addRow("axes", self.axes)
         rest.addRow("region", self.region.native)

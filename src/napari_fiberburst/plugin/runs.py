@@ -174,6 +174,7 @@ class RunsPanel(QWidget):
         names = [run.name for _, run in self._removed]
         self._what_was_removed.setText(f"removed: {', '.join(names)}")
         self._undo.setVisible(bool(names))
+        self.undo_button.setEnabled(bool(names))
 
     def _let_go(self) -> None:
         """Let go of what was removed: it cannot be brought back any more."""

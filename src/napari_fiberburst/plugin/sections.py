@@ -28,10 +28,13 @@ class Column(QScrollArea):
     ----------
     content : QWidget
         What is in it.
+    *hidden : QWidget
+        What may be shown later in it, and has its room from the start: the column shall not widen under the pointer.
     """
 
-    def __init__(self, content: QWidget) -> None:
+    def __init__(self, content: QWidget, *hidden: QWidget) -> None:
         super().__init__()
+        self._hidden = hidden
         self.setWidgetResizable(True)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setFrameShape(QScrollArea.Shape.NoFrame)
@@ -44,7 +47,10 @@ class Column(QScrollArea):
             return super().minimumSizeHint()
         # The viewer's style gives even this one a frame.
         around = bar.sizeHint().width() + 2 * self.frameWidth()
-        return QSize(content.minimumSizeHint().width() + around, super().minimumSizeHint().height())
+        margins = content.contentsMargins() if (layout := content.layout()) is None else layout.contentsMargins()
+        later = (widget.minimumSizeHint().width() + margins.left() + margins.right() for widget in self._hidden)
+        width = max(content.minimumSizeHint().width(), *later, 0)
+        return QSize(width + around, super().minimumSizeHint().height())
 
     def eventFilter(self, watched: Any, event: Any) -> bool:
         """Ask anew when what is in it has changed."""

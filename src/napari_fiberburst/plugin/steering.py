@@ -93,6 +93,8 @@ class SteeringBox(QWidget):
         self.setVisible(turning is not None)
         self._picker.follow(None if turning is None else turning.run)
         if turning is None:
+            for button in (self.back_button, self.frame_button):  # keys press them where they are not seen
+                button.setEnabled(False)
             return
         self.slider.blockSignals(True)
         self.slider.setValue(round(_STEPS_PER_DECADE * math.log10(turning.smoothness)))
@@ -175,7 +177,7 @@ class SteeringBox(QWidget):
         is_out = turning is not None and frame in turning.asked.leave_out
         number = "" if frame is None else f" {frame}"
         self.frame_button.setText(f"Take in frame{number}" if is_out else f"Leave out frame{number}")
-        self.frame_button.setEnabled(frame is not None)
+        self.frame_button.setEnabled(turning is not None and frame is not None)
 
     def _lay_out(self) -> None:
         self.slider.setRange(*(round(_STEPS_PER_DECADE * math.log10(value)) for value in (_LEAST, _MOST)))

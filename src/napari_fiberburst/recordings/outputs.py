@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +19,7 @@ from napari_fiberburst.recordings.track import Track
 from napari_fiberburst.recordings.work import is_begun
 
 ENDING = ".ome.zarr"
+_POSES, _TRACES, _TABLE = _BESIDE = (".poses.csv", ".traces.zarr", ".traces.csv")
 # Units of length as OME-NGFF names them.
 OME_UNITS = {"µm": "micrometer", "nm": "nanometer", "mm": "millimeter"}
 
@@ -58,13 +60,20 @@ def outputs_of(output: Path) -> list[Path]:
 
 def poses_of(output: Path) -> Path:
     """Return the table of places beside an output."""
-    return output.with_name(output.name.removesuffix(ENDING) + ".poses.csv")
+    return output.with_name(output.name.removesuffix(ENDING) + _POSES)
 
 
 def traces_of(output: Path) -> tuple[Path, Path]:
     """Return the traces beside a video, of cores and of regions."""
-    zarr, table = (output.with_name(output.name.removesuffix(ENDING) + end) for end in (".traces.zarr", ".traces.csv"))
+    zarr, table = (output.with_name(output.name.removesuffix(ENDING) + end) for end in (_TRACES, _TABLE))
     return zarr, table
+
+
+def is_beside(output: Path, path: Path) -> bool:
+    """Whether a path is one that a mosaic or a video writes: the output, its pieces, or their tables and traces."""
+    stem = re.escape(output.name.removesuffix(ENDING))
+    endings = "|".join(map(re.escape, (ENDING, *_BESIDE)))
+    return path.parent == output.parent and re.fullmatch(rf"{stem}(-\d+)?({endings})", path.name) is not None
 
 
 def piece_of(output: Path, piece: int) -> Path:

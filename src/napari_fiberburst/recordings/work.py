@@ -31,6 +31,8 @@ _IDENTITY, _OUTPUTS = "work.json", "outputs.json"
 # A unit that fails by something else than what a user can mend, such as a file server that did not answer, is tried
 # again so many times.
 _RETRIES = 2
+# What the client hands to workers is in a file of this name and its digest.
+_HANDED = "handed-"
 # As many digits of a key tell one from another.
 _DIGITS = 12
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -222,7 +224,7 @@ def _handed(work: Work) -> str:
     In a file, because what was scattered is gone when the worker that holds it is.
     """
     told = pickle.dumps(work)
-    path = work.folder / f"handed-{sha256(told).hexdigest()[:_DIGITS]}.pickle"
+    path = work.folder / f"{_HANDED}{sha256(told).hexdigest()}.pickle"
     with write_whole(path) as stream:
         stream.write(told)
     return str(path)
@@ -230,8 +232,18 @@ def _handed(work: Work) -> str:
 
 @lru_cache(maxsize=2)
 def _taken(path: str) -> Work:
-    """Return the work that was handed over: one object for all units, so that what they know by it is known once."""
-    work: Work = pickle.loads(Path(path).read_bytes())
+    """Return the work that was handed over: one object for all units, so that what they know by it is known once.
+
+    Raises
+    ------
+    OutputError
+        The file is not what the client has written: unpickling what somebody else has put there would run it.
+    """
+    file = Path(path)
+    told = file.read_bytes()
+    if sha256(told).hexdigest() != file.stem.removeprefix(_HANDED):
+        raise OutputError(f"{file} was altered since this run wrote it; give the same command again with --fresh")
+    work: Work = pickle.loads(told)
     return work
 
 
@@ -308,9 +320,17 @@ def own(folder: Path, paths: Sequence[Path]) -> None:
     _write_json(folder / _OUTPUTS, [str(path) for path in dict.fromkeys([*known, *paths])])
 
 
-def discard(folder: Path) -> None:
-    """Remove work that was begun, and what it had begun to write."""
-    for path in _owned(folder):
+def discard(folder: Path, is_ours: Callable[[Path], bool]) -> None:
+    """Remove work that was begun, and what it had begun to write.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the work. Somebody else may have made it.
+    is_ours : callable
+        Whether a path may be removed where the folder says that it was begun there.
+    """
+    for path in filter(is_ours, _owned(folder)):
         remove(path)
     finish(folder)
 
@@ -325,8 +345,8 @@ def finish(folder: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file or a folder, if it is there."""
-    if path.is_dir():
+    """Remove a file, a folder or a link, if it is there."""
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)

@@ -191,9 +191,10 @@ class PictureTask(Task):
 
     def _fail(self, problem: str) -> None:
         """Say why a run came to nothing."""
-        if self._run is not None:
-            self.runs.remove(self._run)
-        self.display.fail(problem)
+        run = self._run
+        if run is not None:
+            self.runs.remove(run)
+        self.display.fail("The run" if run is None else run.name, problem)
         show_error(problem)
 
     def _forget(self, run: KeptRun) -> None:
