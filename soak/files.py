@@ -79,6 +79,8 @@ def targets(folder: Path) -> dict[str, Target]:
     reads("bundle", kept, lambda: Bundle.load(kept), lambda value: None if value.pitch > 0 else "no pitch")
     saved = result.save(folder / "scene.npz")
     reads("result", saved, lambda: load(saved, "cpu"), wrong_with)
+    model = result.save(folder / "scene.fiberburst")
+    reads("model", model, lambda: load(model, "cpu"), wrong_with)
     settings = folder / "batch.toml"
     settings.write_text("[recording]\nframe_rate = 20\n[video]\nwindow = 9\nstabilised = true\n")
     reads("settings", settings, lambda: read_settings(settings, "video"), lambda value: None)

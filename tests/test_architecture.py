@@ -23,7 +23,7 @@ ALLOWED = {
     "io": BASE,
     "simulation": BASE,
     "quality": BASE,
-    "results": BASE | {"io", "bundle", "coordinates", "quality"},
+    "results": BASE | {"io", "stored", "bundle", "coordinates", "quality"},
     "operators": BASE | {"coordinates"},
     "bundle": BASE | {"coordinates", "operators", "device", "steps", "stored", "io"},
     "motion": BASE | {"coordinates", "operators", "steps", "stored", "bundle"},

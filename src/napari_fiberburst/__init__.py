@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from napari_fiberburst.motion.register import refine as refine
     from napari_fiberburst.motion.register import register as register
     from napari_fiberburst.motion.registration import Registration as Registration
-    from napari_fiberburst.networks.image import load as load
+    from napari_fiberburst.networks.saved import load as load
     from napari_fiberburst.pipeline.choose import best_burst as best_burst
     from napari_fiberburst.pipeline.diagnose import diagnose as diagnose
     from napari_fiberburst.pipeline.reconstruct import iterate as iterate
@@ -68,7 +68,7 @@ _HOMES = {
     "find_doubled": "io",
     "flatten": "pipeline.remeasure",
     "iterate": "pipeline.reconstruct",
-    "load": "networks.image",
+    "load": "networks.saved",
     "mosaic": "recordings.mosaic",
     "open_recording": "io",
     "read_burst": "io",

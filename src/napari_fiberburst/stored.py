@@ -18,7 +18,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from napari_fiberburst.errors import FiberBurstError, OutputError
-from napari_fiberburst.io.plain import parse_json
+from napari_fiberburst.io.plain import parse_json, plain_scalar
 from napari_fiberburst.io.results import check_place, write_whole
 
 Arrays = dict[str, NDArray[Any]]
@@ -32,7 +32,8 @@ _LENGTH, _LONGEST_HEADER = 8, 100_000_000
 class Stored:
     """A frozen dataclass that can be kept in a file.
 
-    Its fields are numpy arrays, tensors, plain values that JSON can hold, dataclasses of these, or None.
+    Its fields are numpy arrays, tensors, plain values that JSON can hold, arrays by name (`Arrays`), dataclasses of
+    these, or None.
     """
 
     __slots__ = ()
@@ -51,7 +52,7 @@ class Stored:
         """
         target = self.check_output(path)
         arrays: Arrays = {}
-        document = json.dumps(_flattened(self, "", arrays), allow_nan=True, sort_keys=True)
+        document = _document(self, arrays)
         metadata = {
             "format": f"napari-fiberburst {self._kind}",
             "version": str(_VERSION),
@@ -65,7 +66,7 @@ class Stored:
     def digest(self) -> str:
         """Return what tells this value from others of its kind: another one where anything in it differs."""
         arrays: Arrays = {}
-        return _digest(arrays, json.dumps(_flattened(self, "", arrays), allow_nan=True, sort_keys=True))
+        return _digest(arrays, _document(self, arrays))
 
     @classmethod
     def check_output(cls, path: str | Path) -> Path:
@@ -199,15 +200,22 @@ class _Safetensors:
         return found
 
 
+def _document(value: Any, arrays: Arrays) -> str:
+    """Return all of a dataclass that is no array, as JSON; its arrays go into `arrays`."""
+    return json.dumps(_flattened(value, "", arrays), allow_nan=True, sort_keys=True, default=plain_scalar)
+
+
 def _flattened(value: Any, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Return the plain fields of a dataclass, nested; its arrays go into `arrays` under dotted names."""
     plain: dict[str, Any] = {}
     for item in fields(value):
         part, name = getattr(value, item.name), prefix + item.name
         if hasattr(part, "detach"):
-            arrays[name] = np.ascontiguousarray(part.detach().cpu().numpy())
+            arrays[name] = np.asarray(part.detach().cpu().numpy(), order="C")
         elif isinstance(part, np.ndarray):
-            arrays[name] = np.ascontiguousarray(part)
+            arrays[name] = np.asarray(part, order="C")
+        elif isinstance(part, Mapping) and any(isinstance(one, np.ndarray) for one in part.values()):
+            arrays |= {f"{name}.{own}": np.asarray(one, order="C") for own, one in part.items()}
         elif is_dataclass(part):
             plain[item.name] = _flattened(part, name + ".", arrays)
         else:
@@ -223,6 +231,10 @@ def _built(kind: type[Any], plain: Mapping[str, Any], prefix: str, arrays: Array
         name, hint = prefix + item.name, _without_none(hints[item.name])
         if name in arrays:
             found[item.name] = _placed(arrays[name], device) if hint.__name__ == "Tensor" else arrays[name]
+        elif hint == Arrays:
+            found[item.name] = {
+                own.removeprefix(name + "."): one for own, one in arrays.items() if own.startswith(name + ".")
+            }
         elif plain[item.name] is not None and is_dataclass(hint):
             found[item.name] = _built(hint, plain[item.name], name + ".", arrays, device)  # type: ignore[arg-type]
         elif get_origin(hint) is tuple and plain[item.name] is not None:

@@ -1,4 +1,4 @@
-"""The command ``fiberburst``: reconstruct, mosaic, video, film, live, batch, calibrate, simulate, demo, info."""
+"""The command ``fiberburst``, whose commands turn bursts and recordings into images, and tell of them."""
 
 import argparse
 import io
@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 
 from napari_fiberburst import __version__
-from napari_fiberburst.cli import batch, calibrate, demo, film, info, live, mosaic, reconstruct, simulate, video
+from napari_fiberburst.cli import batch, calibrate, demo, film, info, live, mosaic, reconstruct, render, simulate, video
 from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import FiberBurstError
 
@@ -62,6 +62,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"napari-fiberburst {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (reconstruct, mosaic, video, film, live, batch, calibrate, simulate, demo, info):
+    for command in (reconstruct, render, mosaic, video, film, live, batch, calibrate, simulate, demo, info):
         command.add_to(commands)
     return parser

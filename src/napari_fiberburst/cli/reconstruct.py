@@ -40,8 +40,8 @@ def add_to(commands: Any) -> None:
         "-o",
         "--output",
         type=Path,
-        help="image.ome.tif (its settings go into image.json beside it), image.png for a quick look, or scene.npz for "
-        "the fitted networks",
+        help="image.ome.tif (its settings go into image.json beside it), image.png for a quick look, or "
+        "scene.fiberburst for all that the result has, to be drawn at any size or looked into later",
     )
     parser.add_argument("--report", type=Path, help="report.html, with all that is known of the image, in one file")
     parser.add_argument(

@@ -235,6 +235,33 @@ def check_frame(height: int, width: int, channels: int) -> None:
         )
 
 
+def check_acquisition(known: Acquisition) -> None:
+    """Refuse what a file says of a recording where no recording is like that.
+
+    Raises
+    ------
+    ValueError, TypeError
+        It is not; those of a burst are BurstErrors.
+    """
+    if len(known.shape) != 4 or not all(isinstance(side, int) and side > 0 for side in known.shape):
+        raise BurstError(f"expected frames, height, width and channels; got {known.shape}")
+    frames, height, width, channels = known.shape
+    check_frame(height, width, channels)
+    check_dtype(known.dtype)
+    if known.axes not in ("TYX", "TYXC") or (known.axes == "TYX" and channels > 1):
+        raise BurstError(f"frames of {channels} channels cannot have the axes {known.axes!r}")
+    choose_levels(known.dtype, 0, 0, known.black_level, known.white_level)
+    if not all(isinstance(name, str) for name in known.channel_names) or not isinstance(known.unit, str | None):
+        raise BurstError(f"names and units must be text; got {known.channel_names} and {known.unit!r}")
+    _names(known.channel_names, channels)
+    if known.pixel_size is not None and len(known.pixel_size) != 2:
+        raise BurstError(f"expected height and width of a pixel; got {known.pixel_size}")
+    _pixel_size(known.pixel_size)
+    _times(known.times, frames)
+    if len(known.origin) != 2 or not all(isinstance(at, int) and 0 <= at < MOST_VALUES for at in known.origin):
+        raise BurstError(f"expected the row and column that frames were cropped at; got {known.origin}")
+
+
 def check_dtype(dtype: np.dtype[Any]) -> None:
     """Refuse pixels that are no intensities.
 

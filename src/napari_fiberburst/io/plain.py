@@ -1,6 +1,7 @@
 """JSON from files that anybody may have written."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,3 +54,17 @@ def read_json(path: Path) -> Any:
         raise OutputError(
             f"{path} holds no JSON that can be read ({error}); remove it, or take another file"
         ) from error
+
+
+def plain_scalar(value: Any) -> Any:
+    """Turn numpy's scalars into Python's, as `json.dumps` asks for what it does not know.
+
+    Raises
+    ------
+    TypeError
+        It is none.
+    """
+    convert: Callable[[], Any] | None = getattr(value, "item", None)
+    if convert is None:
+        raise TypeError(f"{type(value).__name__} has no place in JSON")
+    return convert()

@@ -6,7 +6,7 @@ Every file is written whole or not at all.
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from glob import has_magic
 from importlib.metadata import PackageNotFoundError, version
@@ -21,15 +21,17 @@ from numpy.typing import NDArray
 from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.bounds import open_arrays
-from napari_fiberburst.io.plain import parse_json, read_json
+from napari_fiberburst.io.plain import parse_json, plain_scalar, read_json
 
 IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
+# All that a result has; no other program has files of this name.
+MODEL_ENDING = ".fiberburst"
 REPRESENTATION_ENDING = ".npz"
 PICTURE_ENDING = ".png"
 # Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
 _OME_UNITS = ("pm", "Å", "nm", "µm", "mm", "cm", "m", "in", "pixel")
-_SOFTWARE = "napari-fiberburst"
-_NAMED_PACKAGES = (_SOFTWARE, "numpy", "scipy", "torch", "scikit-image", "tifffile")
+SOFTWARE = "napari-fiberburst"
+_NAMED_PACKAGES = (SOFTWARE, "numpy", "scipy", "torch", "scikit-image", "tifffile")
 
 
 def check_output(path: str | Path, source: Path | None = None) -> Path:
@@ -49,10 +51,11 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
         the source or no result of ours, or would be taken for one of the source's frames.
     """
     target = Path(path)
-    endings = (*IMAGE_ENDINGS, REPRESENTATION_ENDING, PICTURE_ENDING)
+    endings = (*IMAGE_ENDINGS, MODEL_ENDING, REPRESENTATION_ENDING, PICTURE_ENDING)
     if not target.name.lower().endswith(endings):
         raise OutputError(f"a result is written to a file ending in {', '.join(endings)}; got {target}")
-    files = [target] if is_representation(target) or is_picture(target) else [target, sidecar_of(target)]
+    is_image = target.name.lower().endswith(IMAGE_ENDINGS)
+    files = [target, sidecar_of(target)] if is_image else [target]
     for file in files:
         check_place(file)
         if source is not None and file.exists() and source.exists() and file.samefile(source):
@@ -66,8 +69,13 @@ def check_output(path: str | Path, source: Path | None = None) -> Path:
     return target
 
 
+def is_model(path: Path) -> bool:
+    """Whether a path names a model: all that a result has."""
+    return path.name.lower().endswith(MODEL_ENDING)
+
+
 def is_representation(path: Path) -> bool:
-    """Whether a path names the fitted networks rather than an image."""
+    """Whether a path names what an image is drawn from, and no more, as version 0.1.0 wrote it."""
     return path.name.lower().endswith(REPRESENTATION_ENDING)
 
 
@@ -98,7 +106,7 @@ def write_image(
         image, metadata["axes"] = np.moveaxis(image, 2, 0), "CYX"
         if acquisition.channel_names:
             metadata["Channel"] = {"Name": list(acquisition.channel_names)}
-    document = json.dumps({**versions(), **provenance}, indent=1, allow_nan=False, default=_plain)
+    document = json.dumps(provenance, indent=1, allow_nan=False, default=plain_scalar)
     with write_whole(target) as stream, write_whole(sidecar_of(target)) as sidecar:
         tifffile.imwrite(stream, image, ome=True, photometric="minisblack", metadata=metadata)
         sidecar.write(document.encode())
@@ -108,7 +116,7 @@ def write_image(
 def write_representation(path: str | Path, arrays: Mapping[str, NDArray[Any]], provenance: Mapping[str, Any]) -> Path:
     """Write named arrays and their provenance into one npz file."""
     target = check_output(path)
-    document = json.dumps({**versions(), **provenance}, allow_nan=False, default=_plain)
+    document = json.dumps(provenance, allow_nan=False, default=plain_scalar)
     with write_whole(target) as stream:
         np.savez(stream, allow_pickle=False, provenance=np.array(document), **arrays)
     return target
@@ -240,7 +248,7 @@ def _is_ours(path: Path) -> bool:
         told = read_json(path)
     except OutputError:
         return False
-    return isinstance(told, dict) and told.get("software") == _SOFTWARE
+    return isinstance(told, dict) and told.get("software") == SOFTWARE
 
 
 def versions() -> dict[str, Any]:
@@ -251,12 +259,4 @@ def versions() -> dict[str, Any]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return {"software": _SOFTWARE, "versions": found}
-
-
-def _plain(value: Any) -> Any:
-    """Turn numpy's scalars into Python's for JSON."""
-    convert: Callable[[], Any] | None = getattr(value, "item", None)
-    if convert is None:
-        raise TypeError(f"{type(value).__name__} has no place in JSON")
-    return convert()
+    return {"software": SOFTWARE, "versions": found}

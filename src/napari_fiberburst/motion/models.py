@@ -131,6 +131,11 @@ class FrameMotion:
             return None
         spacing, rows, columns, height, width = arrays["control_grid"].tolist()
         grid = ControlGrid(spacing, (int(rows), int(columns)))
+        expected = (len(arrays["scene_from_frame"]), 2, grid.shape[0] * grid.shape[1])
+        if arrays["control"].shape != expected or not 0 < spacing < np.inf:
+            raise ValueError(f"control points are of shape {arrays['control'].shape}, expected {expected}")
+        if arrays["scene_from_frame"].dtype != "float64" or arrays["scene_from_frame"].shape[1:] != (3, 3):
+            raise ValueError(f"transforms are of shape {arrays['scene_from_frame'].shape}, expected (T, 3, 3) float64")
         displacement = Displacement(grid, torch.from_numpy(arrays["control"]))
         return cls(torch.from_numpy(arrays["scene_from_frame"]), (int(height), int(width)), displacement)
 

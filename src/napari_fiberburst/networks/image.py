@@ -1,7 +1,6 @@
-"""The fitted field as a compressed representation of the burst: drawn at any size, saved, loaded, continued."""
+"""The fitted field as a compressed representation of the burst: drawn at any size, kept, continued."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,23 +9,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.coordinates import in_pixels, relative_to, unit_from_pixel
-from napari_fiberburst.data.burst import Acquisition, check_frame
-from napari_fiberburst.data.canvas import Canvas
-from napari_fiberburst.device import find_device
-from napari_fiberburst.errors import OutputError
-from napari_fiberburst.io.results import read_representation
 from napari_fiberburst.networks.field import JointField
-from napari_fiberburst.quality.resolution import RingCorrelation
-from napari_fiberburst.results.reconstruction import Reconstruction, draw
 from napari_fiberburst.scene.image import SplineImage
-from napari_fiberburst.settings import NetworkMethod, Settings, SplineMethod, TrainedMethod
+from napari_fiberburst.settings import NetworkMethod, TrainedMethod
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
 _CHUNK = 16_384
 _DRAWN = "samples_drawn"
 _BEHIND = "behind."
-# Names in files of 0.1.0.
-_FORMER_NAMES = {"sample_error": "held_out_rmse", "frame0_from_image": "reference_from_image"}
 
 
 class Representation:
@@ -98,6 +88,41 @@ class Representation:
         behind = {} if self.behind is None else self.behind.arrays()
         return {**parameters, _DRAWN: np.array(self.drawn), **{_BEHIND + name: part for name, part in behind.items()}}
 
+    @classmethod
+    def from_arrays(
+        cls,
+        arrays: dict[str, NDArray[Any]],
+        method: TrainedMethod,
+        shape: tuple[int, int, int, int],
+        device: torch.device,
+    ) -> "Representation":
+        """Rebuild a representation of a burst (frames, height, width, channels) from `arrays`.
+
+        Raises
+        ------
+        ValueError
+            The arrays are not those of the method's networks. No memory is taken for networks of another size.
+        """
+        kept = {name.removeprefix(_BEHIND): part for name, part in arrays.items() if name.startswith(_BEHIND)}
+        own = {
+            name: torch.from_numpy(part)
+            for name, part in arrays.items()
+            if name != _DRAWN and not name.startswith(_BEHIND)
+        }
+
+        def untrained() -> JointField:
+            start = torch.eye(3).repeat(shape[0], 1, 1) if isinstance(method, NetworkMethod) else None
+            return JointField(method, shape, start=start)
+
+        with torch.device("meta"):
+            sizes = {name: part.shape for name, part in untrained().state_dict().items()}
+        if sizes != {name: part.shape for name, part in own.items()}:
+            raise ValueError("its arrays are not those of the networks that it tells of")
+        field = untrained()
+        field.load_state_dict(own)
+        behind = SplineImage.from_arrays(kept, device) if kept else None
+        return cls(field.to(device), shape[1:3], drawn=int(arrays[_DRAWN].item()), behind=behind)
+
     def _by_chunks(
         self, function: Callable[[Tensor, Tensor], Tensor], points: NDArray[np.float64], frame: int
     ) -> NDArray[np.float32]:
@@ -111,127 +136,3 @@ class Representation:
                 parts.append(function(chunk, frames).cpu())
         values: NDArray[np.float32] = torch.cat(parts).numpy().reshape(*points.shape[:2], -1)
         return values
-
-
-def load(path: str | Path, device: str = "auto") -> Reconstruction:
-    """Read a reconstruction that was saved as ``.npz``, to draw it at any size or to continue it.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-    device : str
-        Where to draw it.
-
-    Returns
-    -------
-    Reconstruction
-        With the image drawn anew.
-
-    Raises
-    ------
-    OutputError
-        The file is not there, is no saved reconstruction, or is one whose image is NaN or infinity.
-    DeviceError
-        The device is not on this machine.
-    """
-    place = find_device(device)
-    arrays, provenance = read_representation(path)
-    try:
-        return _rebuild(arrays, _with_names_of_today(provenance), place)
-    except Exception as error:  # contents that do not belong together fail anywhere, in numpy, scipy or torch
-        raise OutputError(
-            f"{path} is no reconstruction that this version can read ({error!r}); make it again, or take another file"
-        ) from error
-
-
-def _with_names_of_today(plain: Any) -> Any:
-    """Return what a file says with the names that its version had before replaced."""
-    if not isinstance(plain, dict):
-        return plain
-    return {_FORMER_NAMES.get(name, name): _with_names_of_today(value) for name, value in plain.items()}
-
-
-def _rebuild(arrays: dict[str, NDArray[Any]], provenance: dict[str, Any], device: torch.device) -> Reconstruction:
-    settings = Settings.from_dict(provenance["settings"])
-    acquisition = Acquisition.from_dict(provenance["burst"])
-    canvas = _canvas(provenance["canvas"], acquisition)
-    reference = int(provenance.get("reference", 0))
-    renderer: SplineImage | Representation
-    if isinstance(settings.method, SplineMethod):
-        renderer = SplineImage.from_arrays(arrays, device)
-        homographies = renderer.homographies
-    else:
-        renderer = _rebuild_networks(arrays, settings.method, acquisition, device)
-        homographies = renderer.homographies()
-    return Reconstruction(
-        image=_drawn(renderer, canvas, reference, acquisition),
-        canvas=canvas,
-        homographies=homographies,
-        losses=np.array([np.nan if loss is None else loss for loss in provenance["losses"]], dtype=np.float32),
-        requested=Settings.from_dict(provenance.get("requested", provenance["settings"])),
-        settings=settings,
-        seconds=float(provenance["seconds"]),
-        parameters=int(provenance["parameters"]),
-        device=str(device),
-        ending=provenance["ending"],
-        acquisition=acquisition,
-        renderer=renderer,
-        reference=reference,
-        held_out_rmse=provenance.get("held_out_rmse"),
-        frames_used=None if provenance.get("frames_used") is None else tuple(provenance["frames_used"]),
-        confidence=_per_frame(provenance, "confidence"),
-        quality=provenance.get("quality"),
-        misfit=provenance.get("misfit"),
-        exposures=_per_frame(provenance, "exposures"),
-        resolution=provenance.get("resolution"),
-        agreement=_agreement(provenance),
-        notes=tuple(provenance.get("notes", ())),
-    )
-
-
-def _canvas(told: dict[str, Any], acquisition: Acquisition) -> Canvas:
-    height, width = told["shape"]
-    if not (isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0):
-        raise ValueError(f"an image of {height!r} x {width!r} pixels cannot be drawn")
-    check_frame(height, width, acquisition.shape[3])
-    return Canvas(shape=(height, width), reference_from_image=np.array(told["reference_from_image"]))
-
-
-def _drawn(
-    renderer: SplineImage | Representation, canvas: Canvas, frame: int, acquisition: Acquisition
-) -> NDArray[np.float32]:
-    """Draw the image; refuse one that shows nothing, which no run has made."""
-    image = draw(renderer, canvas, frame, acquisition)
-    if np.isinf(image).any() or np.isnan(image).all():
-        raise ValueError("its image is NaN or infinity; the file is damaged, so make it again")
-    return image
-
-
-def _per_frame(provenance: dict[str, Any], name: str) -> NDArray[np.float64] | None:
-    """Return one number a frame, NaN where the file has none; None where it does not know them."""
-    values = provenance.get(name)
-    return None if values is None else np.array(values, dtype=np.float64)
-
-
-def _agreement(provenance: dict[str, Any]) -> RingCorrelation | None:
-    told, resolution = provenance.get("agreement"), provenance.get("resolution")
-    if told is None:
-        return None
-    frequency, correlation = (_per_frame(told, name) for name in ("frequency", "correlation"))
-    assert frequency is not None
-    assert correlation is not None
-    return RingCorrelation(frequency, correlation, np.nan if resolution is None else resolution)
-
-
-def _rebuild_networks(
-    arrays: dict[str, NDArray[Any]], method: TrainedMethod, acquisition: Acquisition, device: torch.device
-) -> Representation:
-    count, height, width, channels = acquisition.shape
-    drawn = int(arrays.pop(_DRAWN))
-    kept = {name.removeprefix(_BEHIND): arrays.pop(name) for name in list(arrays) if name.startswith(_BEHIND)}
-    start = torch.eye(3).repeat(count, 1, 1) if isinstance(method, NetworkMethod) else None
-    field = JointField(method, (count, height, width, channels), start=start)
-    field.load_state_dict({name: torch.from_numpy(value) for name, value in arrays.items()})
-    behind = SplineImage.from_arrays(kept, device) if kept else None
-    return Representation(field.to(device), (height, width), drawn=drawn, behind=behind)

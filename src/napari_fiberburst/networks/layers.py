@@ -10,7 +10,8 @@ from torch import Generator, Tensor, nn
 def make_linear(inputs: int, outputs: int, bound: float, generator: Generator) -> nn.Linear:
     """Return a layer with weights uniform in +- bound and biases uniform in +- 1/sqrt(inputs), as torch has it."""
     # torch's own start would draw from its global generator.
-    layer: nn.Linear = nn.utils.skip_init(nn.Linear, inputs, outputs)  # type: ignore[no-untyped-call]
+    device = torch.get_default_device()  # meta, where only the sizes are asked for
+    layer: nn.Linear = nn.utils.skip_init(nn.Linear, inputs, outputs, device=device)  # type: ignore[no-untyped-call]
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
         layer.bias.uniform_(-1 / math.sqrt(inputs), 1 / math.sqrt(inputs), generator=generator)

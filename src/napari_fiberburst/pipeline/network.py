@@ -21,7 +21,8 @@ from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.spline import SplineFit
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
-from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
+from napari_fiberburst.results.diagnostics import Ending
+from napari_fiberburst.results.reconstruction import Reconstruction, draw
 from napari_fiberburst.settings import Fourier, NetworkMethod, PublishedMethod, Settings, TrainedMethod
 
 logger = logging.getLogger(__name__)

@@ -9,7 +9,8 @@ from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.fitted import Fitted
-from napari_fiberburst.results.reconstruction import Ending, Reconstruction, Solver, draw
+from napari_fiberburst.results.diagnostics import Ending
+from napari_fiberburst.results.reconstruction import Reconstruction, Solver, draw
 from napari_fiberburst.settings import (
     Affine,
     AutoMotion,

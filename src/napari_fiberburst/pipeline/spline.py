@@ -11,7 +11,8 @@ from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.outcome import Order
 from napari_fiberburst.pipeline.stages import Stages
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
-from napari_fiberburst.results.reconstruction import Ending, Reconstruction, draw
+from napari_fiberburst.results.diagnostics import Ending
+from napari_fiberburst.results.reconstruction import Reconstruction, draw
 from napari_fiberburst.settings import Settings, SplineMethod
 
 # Rounds and stages that a fit has, about: what is left is counted in these.

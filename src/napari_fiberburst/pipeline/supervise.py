@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.results.diagnostics import Ending
 from napari_fiberburst.results.progress import Progress
-from napari_fiberburst.results.reconstruction import Ending, Reconstruction
+from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.settings import Settings
 
 # Reports make the host wait for the device, so there are few of them, and more would not be seen.

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import tifffile
 
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
 from napari_fiberburst.io.bounds import open_arrays
+from napari_fiberburst.io.results import is_model, write_whole
 from napari_fiberburst.io.video_container import VIDEO_ENDINGS
 from napari_fiberburst.plugin import METADATA_KEY, RECORDING_KEY
 
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
-    from napari_fiberburst.data.burst import Burst
+    from napari_fiberburst.data.burst import Acquisition, Burst
 
 LayerData = tuple[Any, dict[str, Any], str]
 PLUGIN = "napari-fiberburst"
@@ -98,7 +100,7 @@ retina_round = partial(make_sample, "retina", "core", field=0.95, overlay=True, 
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[LayerData]] | None:
-    """Return a reader for a recording, a folder of frames, a simulated burst or a bundle, None for anything else.
+    """Return a reader for a recording, a folder of frames, a simulated burst, a bundle or a model, None for all else.
 
     Several videos, which napari gives where they are to be one stack, are one recording.
     """
@@ -107,6 +109,8 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
     place = Path(path)
     if place.suffix.lower() == ".bundle":
         return read_bundle
+    if is_model(place):
+        return read_model
     is_burst = place.suffix.lower() in (*ARCHIVE_ENDINGS, *VIDEO_ENDINGS) or (place.is_dir() and _holds_frames(place))
     return read if is_burst else None
 
@@ -122,6 +126,28 @@ def read_bundle(path: str | Sequence[str]) -> list[LayerData]:
     from napari_fiberburst.bundle.bundle import Bundle
 
     return bundle_layers(Bundle.load(str(path)), Path(str(path)).stem, path=str(path))
+
+
+def read_model(path: str | Sequence[str]) -> list[LayerData]:
+    """Open a model as the layers of its run: its image and, hidden, what that rests on.
+
+    An image that is not good is told to be so.
+
+    Raises
+    ------
+    OutputError
+        The file is no model, or is damaged.
+    """
+    from napari.utils.notifications import show_warning
+
+    from napari_fiberburst.networks.saved import load
+    from napari_fiberburst.plugin.models import model_layers
+
+    place = Path(str(path))
+    result = load(place)
+    if result.quality not in (None, "good"):
+        show_warning(f"{place.name}: the image is {result.quality}: {'; '.join(result.notes)}")
+    return model_layers(result, place.stem, _look(result.acquisition))
 
 
 def bundle_layers(bundle: "Bundle", name: str, *, path: str | None = None) -> list[LayerData]:
@@ -179,9 +205,8 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
             return [recording_layer(source, name_of(path), path)]
     burst = read_burst(str(path))
     frames = _as_recorded(burst)
-    look = _look(
-        burst, Path(str(path)), is_colour=frames.ndim == 4 and frames.shape[3] == 3 and frames.dtype == np.uint8
-    )
+    place = Path(str(path))
+    look = {"name": place.stem, **_look(burst), "metadata": {METADATA_KEY: _truth(place)}}
     if frames.ndim == 4 and not look["rgb"]:
         frames = frames.transpose(0, 3, 1, 2)  # napari draws the last two axes
     recording = {"channel_names": burst.channel_names, "times": () if burst.times is None else burst.times.tolist()}
@@ -190,21 +215,21 @@ def read(path: str | Sequence[str]) -> list[LayerData]:
 
 
 def write(path: str, data: Any, attributes: dict[str, Any]) -> list[str]:
-    """Write the image of a run as OME-TIFF, with its settings and what it rests on as JSON beside it.
+    """Write the image of a run as OME-TIFF, with its settings and findings as JSON beside it, or all of it as a model.
 
     Other image layers become plain OME-TIFF: napari gives this writer every layer that is saved as ``.ome.tif``.
 
     Raises
     ------
     OutputError
-        The file cannot be written.
+        The file cannot be written, or a layer that is of no run was to be written as a model.
     """
     metadata = attributes.get("metadata", {}).get(METADATA_KEY, {})
     result = metadata.get("reconstruction")
     if result is not None:
         return [str(result.save(path))]
-    from napari_fiberburst.io.results import write_whole
-
+    if is_model(Path(path)):
+        raise OutputError(f"a model holds the image of a run, and this layer is none; save it as .ome.tif, not {path}")
     with write_whole(Path(path)) as stream:
         tifffile.imwrite(
             stream, np.asarray(data), ome=True, photometric="rgb" if attributes.get("rgb") else "minisblack"
@@ -252,15 +277,11 @@ def _as_recorded(burst: "Burst") -> np.ndarray:
     return frames if "C" in burst.axes else frames[..., 0]
 
 
-def _look(burst: "Burst", path: Path, *, is_colour: bool) -> dict[str, Any]:
-    """Return how a burst is to be shown, with its pixel size and, in the metadata, its truth."""
+def _look(burst: "Acquisition") -> dict[str, Any]:
+    """Return how a burst is to be shown: as colour or as channels, and with its pixel size."""
+    is_colour = "C" in burst.axes and burst.shape[3] == 3 and burst.dtype == np.uint8
     axes = "tyx" if is_colour or "C" not in burst.axes else "tcyx"
-    look: dict[str, Any] = {
-        "name": path.stem,
-        "rgb": is_colour,
-        "axis_labels": tuple(axes),
-        "metadata": {METADATA_KEY: _truth(path)},
-    }
+    look: dict[str, Any] = {"rgb": is_colour, "axis_labels": tuple(axes)}
     if burst.pixel_size is not None:
         height, width = burst.pixel_size
         sizes = {"y": height, "x": width}

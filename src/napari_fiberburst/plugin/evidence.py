@@ -74,8 +74,15 @@ class Motion:
         return [frame for frame, matrix in enumerate(self.homographies) if np.isfinite(matrix).all()]
 
     def moved(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
-        """Return where a frame's points (N, 2) lie in the reference frame's pixels."""
-        return self.placed(points, frame) if self.shift is None else points + self.shift(points, frame)
+        """Return where a frame's points (N, 2) lie in the reference frame's pixels.
+
+        What that frame shows nowhere, because its flow folds, lies where it would if frames did not bend.
+        """
+        placed = self.placed(points, frame)
+        if self.shift is None:
+            return placed
+        moved = points + self.shift(points, frame)
+        return np.where(np.isfinite(moved).all(axis=1, keepdims=True), moved, placed)
 
     def placed(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
         """Return where they would lie if frames did not bend."""

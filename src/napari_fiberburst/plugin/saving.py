@@ -25,7 +25,7 @@ class SaveButtons(QWidget):
         self._run: KeptRun | None = None
         self.result, self.motion = QPushButton("Save result…"), QPushButton("Save motion…")
         self.bundle = QPushButton("Keep this bundle…")
-        self.result.setToolTip("Save the image with its settings, or the fitted networks.")
+        self.result.setToolTip("Save the image with its settings, or all that the run has, to be opened again.")
         self.motion.setToolTip("Save the homographies of the frames as CSV or JSON.")
         row = QHBoxLayout(self)
         row.setContentsMargins(0, 0, 0, 0)
@@ -52,7 +52,7 @@ class SaveButtons(QWidget):
     def _ask_for_result(self) -> None:
         run = self._run
         if run is not None:
-            kinds = "OME-TIFF and JSON (*.ome.tif);;Representation (*.npz)"
+            kinds = "OME-TIFF and JSON (*.ome.tif);;Model, all that the run has (*.fiberburst);;Picture (*.png)"
             path = self._ask("Save result", f"{run.name}.ome.tif", kinds)
             if path:
                 save_result(run, path)

@@ -265,7 +265,7 @@ def _settings(result: Reconstruction) -> str:
 
 
 def _origin(result: Reconstruction, name: str, call: str | None) -> str:
-    found = versions()["versions"]
+    found = result.made_with.get("versions", {})
     rows = [("seed", _plain(result.settings.seed)), ("device", result.device)]
     rows += [("versions", ", ".join(f"{package} {number}" for package, number in found.items()))]
     again = _call_of(result, name) if call is None else call

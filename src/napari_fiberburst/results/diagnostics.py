@@ -10,6 +10,7 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.quality.resolution import RingCorrelation
 
 Quality = Literal["good", "doubtful", "bad"]
+Ending = Literal["finished", "stopped", "time budget", "diverged"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,14 +90,14 @@ class Diagnostics:
         bundle = self.bundle
         return {
             "quality": self.quality,
-            "misfit": self.misfit,
+            "misfit": _number(self.misfit),
             "outliers": None if self.outliers is None else int(self.outliers.sum()),
-            "held_out_rmse": self.held_out_rmse,
+            "held_out_rmse": _number(self.held_out_rmse),
             "frames_used": self.frames_used,
             "confidence": _plain(self.confidence),
             "exposures": _plain(self.exposures),
             "reference": self.reference,
-            "resolution": self.resolution,
+            "resolution": _number(self.resolution),
             "agreement": None
             if self.agreement is None
             else {name: _plain(getattr(self.agreement, name)) for name in ("frequency", "correlation")},
@@ -121,4 +122,8 @@ class Diagnostics:
 
 def _plain(values: NDArray[np.float64] | None) -> list[float | None] | None:
     """Return numbers as JSON can hold them, None for those that are not finite."""
-    return None if values is None else [float(value) if np.isfinite(value) else None for value in values]
+    return None if values is None else [_number(value) for value in values]
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(value)

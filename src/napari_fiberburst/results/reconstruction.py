@@ -1,10 +1,10 @@
 """Reconstruction: the image a burst gave, how its frames lie on it, and where it all came from."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from operator import index
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,19 @@ from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io.picture import as_picture, write_png
 from napari_fiberburst.io.results import (
     check_output,
+    is_model,
     is_picture,
     is_representation,
+    versions,
     write_image,
     write_representation,
 )
-from napari_fiberburst.results.diagnostics import Diagnostics
+from napari_fiberburst.results.diagnostics import Diagnostics, Ending
+from napari_fiberburst.results.model import Model, compression
 from napari_fiberburst.settings import Settings
 
 _BAND_PIXELS = 2**17
 _NOTHING = np.array(None, dtype=object)
-
-Ending = Literal["finished", "stopped", "time budget", "diverged"]
 
 
 def draw(renderer: "Renderer", canvas: Canvas, frame: int, acquisition: Acquisition) -> NDArray[np.float32]:
@@ -113,6 +114,8 @@ class Reconstruction(Diagnostics):
     solver : Solver or None
         What `solve_again` needs of the run: samples and a first scene, some MB. None where the scene is no spline, the
         run was stopped, or the result was read from a file.
+    made_with : mapping
+        "software", and "versions" of it, of Python, and of the packages that decide its figures.
 
     Notes
     -----
@@ -134,11 +137,12 @@ class Reconstruction(Diagnostics):
     acquisition: Acquisition
     renderer: Renderer = field(repr=False)
     solver: Solver | None = field(default=None, repr=False)
+    made_with: Mapping[str, Any] = field(default_factory=versions, repr=False)
 
     @property
     def compression(self) -> float:
         """1 - bytes of the parameters as float32 / bytes of the burst as it came; below 0 it takes more room."""
-        return 1 - 4 * self.parameters / self.acquisition.nbytes
+        return compression(self.parameters, self.acquisition)
 
     def solve_again(self, *, smoothness: float | None = None, leave_out: Collection[int] = ()) -> "Reconstruction":
         """Solve the scene once more from where its frames lie, at another smoothness or from other frames.
@@ -269,6 +273,7 @@ class Reconstruction(Diagnostics):
     def provenance(self) -> dict[str, Any]:
         """Return where the image came from, as plain values that JSON can hold; None stands for NaN."""
         return {
+            **self.made_with,
             "requested": self.requested.to_dict(),
             "settings": self.settings.to_dict(),
             "seed": self.settings.seed,
@@ -290,15 +295,17 @@ class Reconstruction(Diagnostics):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the image, a picture of it, or the fitted networks themselves.
+        """Write all that the result has, the image, a picture of it, or what it is drawn from.
 
         Parameters
         ----------
         path : str or Path
+            ``.fiberburst``: a model, which `napari_fiberburst.load` reads back as this result, without the burst: what
+            the image rests on too, drawn at any size, or continued (without Adam's moments). `solver` is left out.
             ``.ome.tif`` (or ``.tif``): the image as OME-TIFF with pixel size and channel names, and its
             provenance as JSON beside it. ``.png``: a picture to look at, 8 bits, from the darkest to the brightest
-            thousandth, see-through where the image is NaN. ``.npz``: the compressed representation, which
-            `napari_fiberburst.load` reads back to be rendered at any size or continued (without Adam's moments).
+            thousandth, see-through where the image is NaN. ``.npz``: what the image is drawn from, as 0.1.0 wrote
+            it, to be read back without what the image rests on.
 
         Returns
         -------
@@ -311,6 +318,8 @@ class Reconstruction(Diagnostics):
             The folder does not exist or cannot be written, or the ending is not one of these. Files are replaced
             whole: a killed run leaves the old one or the new one, never half of one.
         """
+        if is_model(Path(path)):
+            return Model.of(self).save(path)
         if is_representation(Path(path)):
             return write_representation(path, self.renderer.arrays(), self.provenance())
         if is_picture(Path(path)):

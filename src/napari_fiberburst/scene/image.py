@@ -112,10 +112,32 @@ class SplineImage:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, NDArray[Any]], device: torch.device) -> "SplineImage":
-        """Rebuild an image from `arrays`."""
+        """Rebuild an image from `arrays`.
+
+        Raises
+        ------
+        ValueError
+            They do not belong together.
+        """
         x0, y0, spacing = arrays["nodes"].tolist()
         reach, fill, black = arrays["drawing"].tolist()
         rows, columns = arrays["known"].shape
+        count = len(arrays["homographies"])
+        for name, dtype, shape in (
+            ("scene", "float32", (len(arrays["scene"]), rows, columns)),
+            ("known", "bool", (rows, columns)),
+            ("homographies", "float64", (count, 3, 3)),
+        ):
+            if arrays[name].dtype != dtype or arrays[name].shape != shape:
+                raise ValueError(f"{name} is {arrays[name].dtype} of {arrays[name].shape}, expected {dtype} of {shape}")
+        if not (0 < spacing < np.inf and np.isfinite(arrays["nodes"]).all()):
+            raise ValueError(f"nodes {spacing} px apart from ({x0}, {y0}) on are no scene")
+        used = np.isfinite(arrays["homographies"]).all(axis=(1, 2))
+        if not used.any():
+            raise ValueError("no frame takes part")
+        for name in {"scene_from_frame", "control"} & set(arrays):
+            if not np.isfinite(arrays[name][used]).all():
+                raise ValueError(f"{name} of frames that take part is not finite")
         return cls(
             scene=torch.from_numpy(arrays["scene"]).to(device),
             grid=Grid(x0, y0, spacing, (rows, columns)),
