@@ -106,7 +106,8 @@ def damaged(count: Count, each: int) -> None:
 def fuzzed(count: Count, seconds: int) -> None:
     """Let atheris look for bytes that take each reader where no bytes before have."""
     with tempfile.TemporaryDirectory() as folder:
-        names = list(targets(Path(folder)))
+        # A video is decoded in a process of its own, which atheris does not follow.
+        names = [name for name in targets(Path(folder)) if name != "video"]
     for name in names:
         words = [sys.executable, "-m", "soak.fuzz", name, str(seconds)]
         done = subprocess.run(words, capture_output=True, text=True, timeout=600 + seconds)
