@@ -225,3 +225,20 @@ def test_strips_that_were_never_written_are_not_taken_for_black(tmp_path, rng):
         counts.overwrite((counts.value[0], 0, counts.value[2]))
     with pytest.raises(BurstError, match="parts of it are missing; copy or export it again"):
         read_burst(path)
+
+
+@pytest.mark.parametrize(("pages", "back"), [(1, 0), (3, 1), (150, 20)])
+def test_pages_that_lead_back_to_one_another_are_refused(tmp_path, pages, back):
+    path = tmp_path / "ring.tif"
+    with tifffile.TiffWriter(path) as writer:
+        for number in range(pages):
+            writer.write(np.full((19, 23), number, np.uint8), contiguous=False, metadata=None)
+    with tifffile.TiffFile(path) as file:
+        offsets = [page.offset for page in file.pages]
+        last, layout = offsets[-1], file.tiff
+    whole = bytearray(path.read_bytes())
+    (tags,) = struct.unpack_from(layout.tagnoformat, whole, last)
+    struct.pack_into(layout.offsetformat, whole, last + layout.tagnosize + tags * layout.tagsize, offsets[back])
+    path.write_bytes(whole)
+    with pytest.raises(BurstError, match="lead back to one another, and have no end; export it again"):
+        read_burst(path)

@@ -64,7 +64,7 @@ def describe_tiff(path: Path) -> dict[str, Any]:
     """
     try:
         with tifffile.TiffFile(path) as file:
-            _check_told(path, file)
+            _check_pages(path, file)
             series = file.series[0]
             axes = with_time(series.axes)
             return _described(file, series.shape[axes.index("T")] if "T" in axes else 1)
@@ -99,6 +99,35 @@ def write_frames(
         tifffile.imwrite(stream, shown, ome=True, photometric="rgb" if is_colour else "minisblack", metadata=described)
 
 
+def _check_pages(path: Path, file: tifffile.TiffFile) -> None:
+    """Refuse pages that tifffile would look for without end, before it is asked for series."""
+    _check_chain(path, file)
+    _check_told(path, file)
+
+
+def _check_chain(path: Path, file: tifffile.TiffFile) -> None:
+    """Refuse pages each of which points to the next one, and one of them back."""
+    offset, seen = file.pages.first.offset, set[int]()
+    while offset:
+        if offset in seen:
+            raise BurstError(f"the pages of {path} lead back to one another, and have no end; export it again")
+        seen.add(offset)
+        try:
+            offset = _following(file, offset)
+        except (struct.error, OSError):
+            return  # it is cut short, which is told later
+
+
+def _following(file: tifffile.TiffFile, offset: int) -> int:
+    """Return where the page after the one at an offset is; 0 after the last."""
+    handle, layout = file.filehandle, file.tiff
+    handle.seek(offset)
+    (tags,) = struct.unpack(layout.tagnoformat, handle.read(layout.tagnosize))
+    handle.seek(offset + layout.tagnosize + tags * layout.tagsize)
+    (following,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
+    return int(following)
+
+
 def _check_told(path: Path, file: tifffile.TiffFile) -> None:
     """Refuse OME metadata that tell of more pages than any file has, before they are looked for."""
     if not (file.is_ome and file.ome_metadata):
@@ -127,13 +156,8 @@ def _check_whole(path: Path, file: tifffile.TiffFile) -> None:
 
 
 def _lacks_pages(file: tifffile.TiffFile) -> bool:
-    handle, layout = file.filehandle, file.tiff
-    last = file.pages[len(file.pages) - 1].offset
-    handle.seek(last)
-    (tags,) = struct.unpack(layout.tagnoformat, handle.read(layout.tagnosize))
-    handle.seek(last + layout.tagnosize + tags * layout.tagsize)
-    (following,) = struct.unpack(layout.offsetformat, handle.read(layout.offsetsize))
-    return bool(following != 0)  # a further page, of which nothing could be read
+    # A further page, of which nothing could be read.
+    return _following(file, file.pages[len(file.pages) - 1].offset) != 0
 
 
 def _lacks_pixels(path: Path, series: tifffile.TiffPageSeries) -> bool:
@@ -160,7 +184,7 @@ class _OpenTiff:
     def __init__(self, path: Path) -> None:
         self.file = tifffile.TiffFile(path)
         try:
-            _check_told(path, self.file)
+            _check_pages(path, self.file)
             first, *others = self.file.series
             # An OME file may hold further images, of which the first is the one.
             self._series = [first] if self.file.is_ome else [first, *others]
