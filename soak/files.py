@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from napari_fiberburst import Bundle, Burst, Samples, load, open_recording, read_burst, reconstruct, sample
+from napari_fiberburst import Bundle, Samples, load, open_recording, read_burst, reconstruct, sample
 from napari_fiberburst.io.pyramid import create_pyramid, write_frames
 from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.recordings.batch import read_settings
 from napari_fiberburst.simulation import simulate, simulate_recording
-from soak.trials import Count, wrong_with
+from soak.trials import Count, wrong_with, wrong_with_burst
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,11 @@ def targets(folder: Path) -> dict[str, Target]:
     tifffile.imwrite(packed, grey, photometric="minisblack", compression="zlib", tile=(32, 32))
     tifffile.imwrite(ome, grey, photometric="minisblack", metadata={"axes": "TYX", "PhysicalSizeX": 0.5})
     for name, path in (("tiff", tif), ("packed", packed), ("ome", ome)):
-        reads(name, path, partial(read_burst, path), _wrong_burst)
+        reads(name, path, partial(read_burst, path), wrong_with_burst)
     archive = folder / "a.burst"
     with archive.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, **simulated.arrays())
-    reads("simulated", archive, lambda: read_burst(archive), _wrong_burst)
+    reads("simulated", archive, lambda: read_burst(archive), wrong_with_burst)
     image = folder / "z.ome.zarr"
     create_pyramid(image, (4, 41, 47), name="z", is_video=True)
     for number, frame in enumerate(grey):
@@ -70,9 +70,9 @@ def targets(folder: Path) -> dict[str, Target]:
         next(p for p in (image / "0" / "c").rglob("*") if p.is_file()),
     ]
     for name, path in zip(("zarr", "zarr array", "zarr chunk"), inner, strict=True):
-        reads(name, path, lambda: open_recording(image).burst(range(2)), _wrong_burst)
+        reads(name, path, lambda: open_recording(image).burst(range(2)), wrong_with_burst)
     clip = write_video(simulate_recording(frames=12, shape=(48, 56), pitch=4.0, seed=1).source, folder / "clip.avi")
-    reads("video", clip, lambda: open_recording(clip).burst(range(4)), _wrong_burst)
+    reads("video", clip, lambda: open_recording(clip).burst(range(4)), wrong_with_burst)
     bundle = result.bundle
     assert bundle is not None
     kept = bundle.save(folder / "probe.bundle")
@@ -135,7 +135,3 @@ def _altered(whole: bytes, random: np.random.Generator) -> bytes:
         at = int(random.integers(min(200, len(whole))))
         changed[at : at + 4] = [b"\xff\xff\xff\x7f", b"\xff\xff\xff\xff", bytes(4)][int(random.integers(3))]
     return bytes(changed)
-
-
-def _wrong_burst(burst: Burst) -> str | None:
-    return None if np.isfinite(burst.frames).all() and burst.frames.ndim == 4 else "frames that are not finite"

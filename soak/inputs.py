@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.simulation import simulate
-from soak.trials import Count, wrong_with
+from soak.trials import Count, wrong_with, wrong_with_burst
 
 TYPES = ("u1", "u2", "u4", "i2", "i8", "f2", "f4", "f8", "?", "c8", "<U3", ">u2", ">f4")
 FILLS = ("burst", "burst", "noise", "even", "zero", "one frame", "steps", "huge", "tiny", "negative")
@@ -166,10 +166,6 @@ def bursts(count: Count, examples: int) -> None:
         array = np.resize(frames, shape)
         more = {"axes": axes, "black_level": black, "white_level": white, "times": times, "pixel_size": size}
         given_here = {name: value for name, value in more.items() if value is not None}
-        count.check(lambda: Burst(array, **given_here), _wrong_with_burst, f"shape {shape}, {given_here}")
+        count.check(lambda: Burst(array, **given_here), wrong_with_burst, f"shape {shape}, {given_here}")
 
     one()
-
-
-def _wrong_with_burst(burst: Burst) -> str | None:
-    return None if np.isfinite(burst.frames).all() and burst.frames.ndim == 4 else "frames that are not finite"

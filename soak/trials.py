@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from napari_fiberburst import FiberBurstError, Reconstruction
+from napari_fiberburst import Burst, FiberBurstError, Reconstruction
 
 # Seconds that any call may take on a busy machine of two cores; the inputs are tiny.
 LONGEST = 60
@@ -114,3 +114,8 @@ def wrong_with(result: Reconstruction) -> str | None:
     if not np.isfinite(result.homographies[result.reference]).all():
         return "a reference without a place"
     return None
+
+
+def wrong_with_burst(burst: Burst) -> str | None:
+    """Return what is wrong with a burst; None where nothing is."""
+    return None if np.isfinite(burst.frames).all() and burst.frames.ndim == 4 else "frames that are not finite"
