@@ -123,10 +123,8 @@ def peer(recording: SimulatedRecording, frames: NDArray[Any], pitch: float) -> s
 
 def drift(seed: int, side: int, pitch: float, count: int) -> str:
     """Return how far places drift while a hand comes back again and again, from what they are early on."""
-    recording = simulate_recording(
-        frames=count, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
-    )
-    true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
+    recording, middle = _slow_hand(seed, side, pitch, count)
+    true = recording.homographies
     engine, off = LiveEngine(bundle_of(recording)), []
     for number in range(count):
         view = engine.push(recording.source.recorded([number])[0, ..., 0])
@@ -143,11 +141,8 @@ def drift(seed: int, side: int, pitch: float, count: int) -> str:
 
 def hour(seed: int, side: int, pitch: float, count: int) -> str:
     """Return how much memory the process has while frames are pushed, 30 a second on a simulated clock."""
-    recording = simulate_recording(
-        frames=LOOP, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
-    )
-    frames = recording.source.recorded(range(LOOP))[..., 0]
-    true, middle = recording.homographies, np.array([(side - 1) / 2, (side - 1) / 2, 1])
+    recording, middle = _slow_hand(seed, side, pitch, LOOP)
+    frames, true = recording.source.recorded(range(LOOP))[..., 0], recording.homographies
     engine, process = LiveEngine(bundle_of(recording)), psutil.Process()
     memory, off = np.zeros(count), np.zeros(count)
     for number in range(count):
@@ -163,6 +158,14 @@ def hour(seed: int, side: int, pitch: float, count: int) -> str:
         f"{view.piece + 1}",
     )
     return " | ".join(cells)
+
+
+def _slow_hand(seed: int, side: int, pitch: float, count: int) -> tuple[SimulatedRecording, NDArray[np.float64]]:
+    """Return a recording of so many frames, and the middle of a frame, (3,)."""
+    recording = simulate_recording(
+        frames=count, shape=(side, side), pitch=pitch, path="handheld", step=SLOW_STEP, seed=seed
+    )
+    return recording, np.array([(side - 1) / 2, (side - 1) / 2, 1])
 
 
 def _first_without_a_bundle(frames: NDArray[Any]) -> float:

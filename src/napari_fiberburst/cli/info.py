@@ -97,7 +97,7 @@ def _facts(model: "Model", size: int) -> Iterator[tuple[str, str]]:
     for note in told.notes:
         yield "note", note
     if told.resolution is not None:
-        yield "resolution", f"two halves of the burst agree down to periods of {told.resolution:.1f} pixels"
+        yield "finest detail", f"{told.resolution:.1f} px: down to it, two halves of the burst agree"
     if told.bundle is not None:
         yield "bundle", f"{len(told.bundle.centres)} {told.bundle.pattern}, {told.bundle.pitch:.2f} pixels apart"
     # As it is reported of the published method: what the scene and its motion are drawn from, beside the burst.
