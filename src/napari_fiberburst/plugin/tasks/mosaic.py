@@ -41,5 +41,5 @@ class MosaicTask(LongTask):
         placed, count, pieces = int((result.track.piece >= 0).sum()), len(result.track), result.track.pieces
         lines = [f"{placed:,} of {count:,} frames are placed, in {f'{pieces} pieces' if pieces > 1 else 'one piece'}."]
         if result.resolution is not None:
-            lines.append(f"It resolves {result.resolution:.3g} pixels.")
+            lines.append(f"Finest detail {result.resolution:.1f} px.")
         return lines
