@@ -146,9 +146,10 @@ def test_nothing_runs_once_it_is_closed(monkeypatch):
 
 
 def test_an_engine_that_is_forgotten_ends_by_itself(monkeypatch):
-    ended = Event()
+    begun, ended = Event(), Event()
 
     def endless(burst):
+        begun.set()
         try:
             while True:
                 yield
@@ -159,6 +160,7 @@ def test_an_engine_that_is_forgotten_ends_by_itself(monkeypatch):
     engine = LiveEngine()
     for frame in frames_of(recorded(), range(25)):
         engine.push(frame)
+    assert begun.wait(60)
     assert not ended.is_set()
     del engine
     collect()
