@@ -9,7 +9,20 @@ import sys
 from collections.abc import Sequence
 
 from napari_fiberburst import __version__
-from napari_fiberburst.cli import batch, calibrate, demo, film, info, live, mosaic, reconstruct, render, simulate, video
+from napari_fiberburst.cli import (
+    batch,
+    calibrate,
+    demo,
+    film,
+    info,
+    live,
+    mosaic,
+    reconstruct,
+    render,
+    resume,
+    simulate,
+    video,
+)
 from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import FiberBurstError
 
@@ -39,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     logging.basicConfig(format="fiberburst: %(message)s", level=logging.WARNING)
-    options = _parser().parse_args(words, argparse.Namespace(words=words))
+    options = _parsed(words)
     # A run that is told to end, as by a batch queue, takes its half-written files with it.
     before = signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(TERMINATED))
     try:
@@ -55,6 +68,10 @@ def _run(words: list[str]) -> int:
     return status
 
 
+def _parsed(words: Sequence[str]) -> argparse.Namespace:
+    return _parser().parse_args(words, argparse.Namespace(words=list(words)))
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="fiberburst",
@@ -64,4 +81,5 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     for command in (reconstruct, render, mosaic, video, film, live, batch, calibrate, simulate, demo, info):
         command.add_to(commands)
+    resume.add_to(commands, _parsed)
     return parser

@@ -8,7 +8,7 @@ from typing import Any
 from napari_fiberburst.cli.mosaic import add_known
 from napari_fiberburst.cli.progress import followed
 from napari_fiberburst.cli.video import add_frames_shown
-from napari_fiberburst.cli.work import add_workers, goes_on
+from napari_fiberburst.cli.work import add_workers, goes_on, remembered
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.report.batch import write_batch
 from napari_fiberburst.results.batch import Row, write_table
@@ -60,7 +60,8 @@ def run(options: argparse.Namespace) -> int:
         write_table(output / "table.csv", rows)
 
     with goes_on(), workers(options.workers, options.scheduler) as client:
-        rows = followed(batching(folder, output, options.task, settings=settings, client=client, on_rows=report))
+        steps = batching(folder, output, options.task, settings=settings, client=client, on_rows=report)
+        rows = followed(remembered(steps, output, options.words))
     failed = [row for row in rows if row.verdict == "failed"]
     for row in failed:
         print(f"{row.name} failed: {'; '.join(row.notes)}")
@@ -79,10 +80,10 @@ def _given(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _make(output: Path) -> None:
+    from napari_fiberburst.recordings.work import check_unused
+
+    check_unused(output)
     try:
         output.mkdir(exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder {output} cannot be made ({error}); choose another place") from error
-    others = [path.name for path in output.iterdir()]
-    if others and not (output / "work.json").exists():
-        raise OutputError(f"{output} holds something else, such as {others[0]}; choose a folder that is new or empty")

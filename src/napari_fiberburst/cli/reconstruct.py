@@ -60,6 +60,16 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--keep-bundle", type=Path, help="write the bundle here, with what this burst has told of it; a .bundle file"
     )
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="RUN.checkpoint",
+        help="keep a fit of networks here while it runs; a run that was killed goes on from it by `fiberburst resume "
+        "RUN.checkpoint`, or where the same command is given again. It is removed when the image is written",
+    )
+    parser.add_argument(
+        "--checkpoint-every", type=float, default=60.0, metavar="SECONDS", help="from one to the next (default 60)"
+    )
     parser.add_argument("--white-level", type=float, help="intensity that stands for full scale")
     add_settings(parser)
     parser.set_defaults(run=run)
@@ -81,6 +91,12 @@ def run(options: argparse.Namespace) -> int:
     choices = settings_of(options)
     settings = choose(**choices)
     _check(options, settings)
+    keeper = None
+    if options.checkpoint is not None:
+        from napari_fiberburst.pipeline.checkpoint import Checkpointing, check_kept  # torch takes seconds to load
+
+        check_kept(settings)
+        keeper = Checkpointing(options.checkpoint, options.checkpoint_every, options.words)
     given = options.bundle if options.bundle is not None else options.calibration
     known = None if given is None else _opened(given)
     burst = read_burst(
@@ -106,7 +122,7 @@ def run(options: argparse.Namespace) -> int:
                 bar.set_postfix(loss=f"{report.loss:.4g}", refresh=False)
             bar.update(report.step - bar.n)
 
-        result = reconstruct(burst, **choices, bundle=known, control=control, on_progress=show)
+        result = reconstruct(burst, **choices, bundle=known, control=control, on_progress=show, checkpoint=keeper)
         if options.output is not None:
             result.save(options.output)
         if options.report is not None:
@@ -130,6 +146,11 @@ def run(options: argparse.Namespace) -> int:
     print(f"wrote {' and '.join(map(str, places))}")
     if options.keep_bundle is not None:
         _keep(options.keep_bundle, result, known)
+    if options.checkpoint is not None and options.checkpoint.exists():
+        if result.ending == "stopped":
+            print(f"to go on: fiberburst resume {options.checkpoint}")
+        else:
+            options.checkpoint.unlink()
     return INTERRUPTED if result.ending == "stopped" else 0
 
 

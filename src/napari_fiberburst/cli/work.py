@@ -5,11 +5,14 @@ import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from napari_fiberburst.cli.progress import followed
 from napari_fiberburst.cli.reconstruct import INTERRUPTED
 from napari_fiberburst.errors import OutputError
+
+if TYPE_CHECKING:
+    from napari_fiberburst.recordings.work import Doing
 
 Result = TypeVar("Result")
 
@@ -84,7 +87,7 @@ def keep_input(inputs: Sequence[Path], *outputs: Path) -> None:
 def worked(
     options: argparse.Namespace,
     shape: tuple[int, int, int, int],
-    steps: Callable[[Any | None], Generator[Any, None, Result]],
+    steps: Callable[[Any | None], Generator["Doing", None, Result]],
 ) -> Result:
     """Do work where the options say, and return what has come of it; `steps` is given the client.
 
@@ -94,9 +97,26 @@ def worked(
         Ctrl-C or SIGTERM: it says how to go on.
     """
     from napari_fiberburst.recordings.cluster import workers
+    from napari_fiberburst.recordings.outputs import work_of
 
     with goes_on(), workers(options.workers, options.scheduler, shape) as client:
-        return followed(steps(client))
+        return followed(remembered(steps(client), work_of(options.output.resolve()), options.words))
+
+
+def remembered(
+    steps: Generator["Doing", None, Result], folder: Path, words: Sequence[str]
+) -> Generator["Doing", None, Result]:
+    """Do steps of work in a folder, which keeps the words of the command from the first of them on, to go on by."""
+    from napari_fiberburst.recordings.work import remember
+
+    try:
+        doing = next(steps)
+    except StopIteration as end:
+        result: Result = end.value
+        return result
+    remember(folder, words)
+    yield doing
+    return (yield from steps)
 
 
 @contextmanager

@@ -26,6 +26,7 @@ from napari_fiberburst.io.plain import parse_json, plain_scalar, read_json
 IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 # All that a result has; no other program has files of this name.
 MODEL_ENDING = ".fiberburst"
+_PARTIAL = ".part"
 REPRESENTATION_ENDING = ".npz"
 PICTURE_ENDING = ".png"
 # Those of OME's schema that a bundle's pixels could be given in; others stand in the JSON alone.
@@ -191,7 +192,7 @@ def write_whole(path: Path) -> Iterator[IO[bytes]]:
         The folder does not exist or cannot be written.
     """
     check_place(path)
-    partial = path.with_name(f".{token_hex(8)}.part")
+    partial = path.with_name(f".{token_hex(8)}{_PARTIAL}")
     try:
         with partial.open("wb") as stream:
             yield stream
@@ -202,6 +203,11 @@ def write_whole(path: Path) -> Iterator[IO[bytes]]:
         raise OutputError(f"{path} cannot be written ({error}); choose another place") from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def is_partial(path: Path) -> bool:
+    """Whether a path names a file that was being written when its run was killed."""
+    return path.name.startswith(".") and path.name.endswith(_PARTIAL)
 
 
 def check_place(path: Path) -> None:

@@ -20,6 +20,7 @@ from napari_fiberburst.networks.motion import AlignedField
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import Encoding, Fourier, Hash, TrainedMethod
+from napari_fiberburst.stored import Arrays
 
 # As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
 BATCHES_PER_FRAME = 8
@@ -33,6 +34,8 @@ _PACE_OF_REGISTERED_MOTION = 0.01
 
 # What two bursts must share to be taken for one.
 _IDENTITY = ("shape", "axes", "dtype", "black_level", "white_level", "origin")
+# Names in files of what Adam knows of each parameter.
+_ADAM, _MOMENTS = "adam.", ("step", "exp_avg", "exp_avg_sq")
 # Of the field, of Adam, and how many samples were drawn.
 State = tuple[dict[str, Any], dict[str, Any], int]
 
@@ -188,6 +191,42 @@ class Problem:
         self.field.load_state_dict(field)
         self.optimizer.load_state_dict(optimizer)
         self.samples.drawn = drawn
+
+    def stored(self, state: State) -> Arrays:
+        """Return the networks and Adam's moments of a state, by name, as a file can hold them."""
+        field, optimizer, _ = state
+        moments = {
+            f"{_ADAM}{number}.{name}": value
+            for number, values in optimizer["state"].items()
+            for name, value in values.items()
+        }
+        return {name: value.cpu().numpy() for name, value in (field | moments).items()}
+
+    @torch.inference_mode(False)
+    def state_from(self, stored: Arrays, drawn: int) -> State:
+        """Return the state that arrays stand for, as `stored` has given them.
+
+        Raises
+        ------
+        ValueError
+            They are of other networks.
+        """
+        field, optimizer, _ = self.state()
+        moments: dict[int, dict[str, Tensor]] = {}
+        for name in [name for name in stored if name.startswith(_ADAM)]:
+            number, moment = name.removeprefix(_ADAM).split(".")
+            moments.setdefault(int(number), {})[moment] = torch.from_numpy(stored[name].copy())
+        networks = {name: part for name, part in stored.items() if not name.startswith(_ADAM)}
+        sizes = {name: tuple(value.shape) for name, value in field.items()}
+        parameters = [tuple(part.shape) for group in self.optimizer.param_groups for part in group["params"]]
+        if sizes != {name: part.shape for name, part in networks.items()} or not all(
+            set(moments.get(number, ())) == set(_MOMENTS)
+            and all(tuple(moments[number][name].shape) == shape for name in _MOMENTS[1:])
+            for number, shape in enumerate(parameters)
+        ):
+            raise ValueError("its arrays are not those of the networks that it tells of")
+        weights = {name: torch.from_numpy(part.copy()) for name, part in networks.items()}
+        return weights, {"state": moments, "param_groups": optimizer["param_groups"]}, drawn
 
     def representation(self, behind: SplineImage | None = None) -> Representation:
         """Return the state as it is now, to draw or to go on from; `behind` is the first image behind the bundle."""

@@ -15,15 +15,24 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.control import Control, Region
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.data.canvas import Canvas
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.training import BehindBundle, Problem, State
+from napari_fiberburst.pipeline.checkpoint import Checkpoint, Checkpointing
 from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.spline import SplineFit
 from napari_fiberburst.pipeline.supervise import Clock, Snapshot
 from napari_fiberburst.results.diagnostics import Ending
 from napari_fiberburst.results.reconstruction import Reconstruction, draw
-from napari_fiberburst.settings import Fourier, NetworkMethod, PublishedMethod, Settings, TrainedMethod
+from napari_fiberburst.settings import (
+    Fourier,
+    NetworkMethod,
+    PublishedMethod,
+    Settings,
+    SplineMethod,
+    TrainedMethod,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -61,8 +70,8 @@ class NetworkFit:
         The method asked for.
     device : torch.device
         Where.
-    control, initial, given
-        As control, initial and bundle of `napari_fiberburst.iterate`.
+    control, initial, given, keeper
+        As control, initial, bundle and checkpointing of `napari_fiberburst.iterate`.
     """
 
     def __init__(
@@ -74,7 +83,9 @@ class NetworkFit:
         control: Control,
         initial: Reconstruction | None,
         given: Bundle | None,
+        keeper: Checkpointing | None,
     ) -> None:
+        self._keeper = keeper
         self._burst, self._requested, self._method, self._device = burst, requested, method, device
         self._control, self._initial = control, initial
         self._aligned = SplineFit(burst, requested, method.alignment, device, given)
@@ -111,7 +122,7 @@ class NetworkFit:
             self._burst, method, self._device, seed=self._requested.seed, initial=self._initial, behind=behind
         )
         self._training = Training(
-            self._burst, self._requested, problem, self._device, self._control, self._initial, fitted
+            self._burst, self._requested, problem, self._device, self._control, self._initial, self._keeper, fitted
         )
         return self._training
 
@@ -128,10 +139,11 @@ def published(
     device: torch.device,
     control: Control,
     initial: Reconstruction | None,
+    keeper: Checkpointing | None,
 ) -> "Training":
     """Return a fit of networks to the frames as they are; the parameters are those of `NetworkFit`."""
     problem = Problem(burst, method, device, seed=requested.seed, initial=initial)
-    return Training(burst, requested, problem, device, control, initial)
+    return Training(burst, requested, problem, device, control, initial, keeper)
 
 
 class Training:
@@ -147,8 +159,8 @@ class Training:
         The networks in the making.
     device : torch.device
         Where.
-    control, initial
-        As in `napari_fiberburst.iterate`.
+    control, initial, keeper
+        As control, initial and checkpointing of `napari_fiberburst.iterate`.
     fitted : Fitted, optional
         The burst, calibrated and registered, with a first image; without, it is fitted as published.
     """
@@ -161,6 +173,7 @@ class Training:
         device: torch.device,
         control: Control,
         initial: Reconstruction | None,
+        keeper: Checkpointing | None,
         fitted: Fitted | None = None,
     ) -> None:
         self._burst, self._requested, self._device, self._control = burst, requested, device, control
@@ -181,9 +194,16 @@ class Training:
         self._favoured_until = 0.0
         self._image: NDArray[np.float32] | None = None
         self._step = 0
+        self._keeper = keeper
+        self._clock: Clock | None = None
+        if keeper is not None and keeper.found is not None:
+            self._go_on_from(keeper.found)
 
     def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
         """Take steps until there are enough."""
+        self._clock = clock
+        if self._keeper is not None and self._keeper.found is not None:
+            clock.leave_out(-self._keeper.found.seconds)
         while self._step < self._iterations:
             self._follow()
             # The loss stays on the device until someone looks.
@@ -193,6 +213,8 @@ class Training:
                 clock.start_steps()
             if self._step % _STEPS_BETWEEN_EVALUATIONS == 1 and self._evaluate_held_out():
                 break
+            if self._keeper is not None and self._keeper.is_due(clock.seconds) and not self._keep_in_file(clock):
+                return "diverged"
             is_due = (self._step == 1 or clock.is_report_due()) and self._step < self._iterations
             if not is_due:
                 yield None
@@ -204,6 +226,8 @@ class Training:
 
     def conclude(self, ending: Ending) -> tuple[Snapshot | None, Ending]:
         """Take the state with the least error of held-out samples, and make sure that it can be drawn."""
+        if ending == "stopped" and self._clock is not None and self._step:
+            self._keep_in_file(self._clock)
         if self._best is not None and ending != "diverged":
             self._evaluate_held_out()
             self._problem.restore(self._best[1].state)
@@ -309,6 +333,54 @@ class Training:
         """What was asked for, with all that has been chosen."""
         return replace(self._requested, method=self._method, device=str(self._device))
 
+    def _keep_in_file(self, clock: Clock) -> bool:
+        """Write a checkpoint, where one is asked for; return whether the fit goes well."""
+        if self._keeper is None:
+            return True
+        if not self._check_and_keep(clock):
+            return False
+        self._keeper.keep(self._checkpoint(self._keeper, clock.seconds))
+        return True
+
+    def _checkpoint(self, keeper: Checkpointing, seconds: float) -> Checkpoint:
+        """Return where the fit stands."""
+        state = self._problem.state()
+        error, best = (None, _Kept(0, self._method, state)) if self._best is None else self._best
+        return Checkpoint(
+            run=keeper.run,
+            method=self._settings.to_dict(),
+            step=self._step,
+            seconds=seconds,
+            losses=np.array(self._losses, dtype=np.float32),
+            state=self._problem.stored(state),
+            drawn=state[-1],
+            best_step=None if error is None else best.step,
+            best_error=error,
+            best_method=replace(self._settings, method=best.method).to_dict(),
+            best_state={} if error is None else self._problem.stored(best.state),
+            best_drawn=best.state[-1],
+            command=keeper.command,
+            folder=keeper.folder,
+        )
+
+    def _go_on_from(self, kept: Checkpoint) -> None:
+        """Return to where an earlier process has come to."""
+        try:
+            state = self._problem.state_from(kept.state, kept.drawn)
+            self._method = _method_of(kept.method)
+            self._problem.restore(state)
+            if kept.best_step is not None and kept.best_error is not None:
+                best = self._problem.state_from(kept.best_state, kept.best_drawn)
+                self._best = (kept.best_error, _Kept(kept.best_step, _method_of(kept.best_method), best))
+        except (ValueError, TypeError, LookupError, RuntimeError) as error:
+            raise OutputError(
+                f"the checkpoint does not belong to this run ({error}); remove it, and begin anew"
+            ) from error
+        if self._method.learning_rate is not None:
+            self._problem.set_learning_rate(self._method.learning_rate)
+        self._losses, self._step = kept.losses.tolist(), kept.step
+        self._kept = (_Kept(self._step, self._method, state),)
+
     def _snapshot(self) -> Snapshot:
         return Snapshot(
             step=self._step,
@@ -351,3 +423,10 @@ class Training:
     def _draw(self) -> NDArray[np.float32]:
         reference = 0 if self._fitted is None else self._fitted.registration.reference
         return draw(self._representation(), self._canvas, reference, self._burst)
+
+
+def _method_of(plain: dict[str, Any]) -> TrainedMethod:
+    method = Settings.from_dict(plain).method
+    if isinstance(method, SplineMethod):
+        raise ValueError("a spline is solved, not trained")
+    return method

@@ -13,6 +13,7 @@ from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.device import find_device, settle_threads
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.io import read_burst
+from napari_fiberburst.pipeline.checkpoint import SECONDS_BETWEEN, Checkpointing, check_kept, told_by
 from napari_fiberburst.pipeline.network import NetworkFit, published
 from napari_fiberburst.pipeline.spline import SplineFit
 from napari_fiberburst.pipeline.supervise import Fit, supervise
@@ -46,6 +47,8 @@ def reconstruct(
     time_budget: float | None = None,
     control: Control | None = None,
     initial: Reconstruction | None = None,
+    checkpoint: str | Path | Checkpointing | None = None,
+    checkpoint_every: float = SECONDS_BETWEEN,
     **more: Any,
 ) -> Reconstruction:
     """Turn a burst into one clean image.
@@ -89,6 +92,12 @@ def reconstruct(
         among them, take the preset's place, but for its time budget and previews. In one process the run goes on
         exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
         Adam's moments start anew.
+    checkpoint : str, Path or Checkpointing, optional
+        A file ending in ``.checkpoint``, in which a fit of networks is kept while it runs. Where the file is there, the
+        run goes on from it, to the same bits on the same CPU: give a killed run once more. Remove it when the
+        result is saved.
+    checkpoint_every : float
+        Seconds from one to the next.
     **more
         Any other parameter of `Settings`, or of the method, motion or encoding chosen, by name: ``learning_rate=1e-3``,
         ``features=128``, ``preview_every=1.0``.
@@ -106,6 +115,8 @@ def reconstruct(
         A setting is unknown, out of range, or does not apply to the choice made.
     DeviceError
         The device is not on this machine.
+    OutputError
+        The checkpoint is of another run, is damaged, or cannot be written.
 
     Examples
     --------
@@ -137,6 +148,10 @@ def reconstruct(
     find_device(settings.device)  # before a long read
     known = bundle if bundle is not None else calibration
     _check_bundle(settings, known)
+    if checkpoint is not None:
+        check_kept(settings)
+        if not isinstance(checkpoint, Checkpointing):
+            checkpoint = Checkpointing(checkpoint, checkpoint_every)
     run = iterate(
         as_burst(frames),
         settings,
@@ -144,6 +159,7 @@ def reconstruct(
         should_stop=should_stop,
         initial=initial,
         bundle=None if known is None else as_bundle(known),
+        checkpointing=checkpoint,
     )
     while True:
         try:
@@ -181,6 +197,7 @@ def iterate(
     should_stop: Callable[[], bool] | None = None,
     initial: Reconstruction | None = None,
     bundle: Bundle | None = None,
+    checkpointing: Checkpointing | None = None,
 ) -> Generator[Progress, None, Reconstruction]:
     """Fit a burst and report while it happens; the generator returns the reconstruction.
 
@@ -191,6 +208,8 @@ def iterate(
         time for at least one step.
     control, should_stop, initial, bundle
         As in `reconstruct`.
+    checkpointing : Checkpointing, optional
+        Where a fit of networks is kept, and goes on from.
 
     Yields
     ------
@@ -209,6 +228,8 @@ def iterate(
         `initial` is not of this burst or of these networks.
     DeviceError
         The device is not on this machine.
+    OutputError
+        The checkpoint is of another run, is damaged, or cannot be written.
     """
     control = Control() if control is None else control
     if not isinstance(control, Control):
@@ -218,14 +239,17 @@ def iterate(
         raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
     device = find_device(settings.device)
     settle_threads()
+    if checkpointing is not None:
+        check_kept(settings)
+        checkpointing.begin(told_by(burst, settings, bundle, initial))
     fit: Fit
     match settings.method:
         case SplineMethod() as method:
             fit = SplineFit(burst, settings, method, device, bundle)
         case NetworkMethod() as method:
-            fit = NetworkFit(burst, settings, method, device, control, initial, bundle)
+            fit = NetworkFit(burst, settings, method, device, control, initial, bundle, checkpointing)
         case PublishedMethod() as method:
-            fit = published(burst, settings, method, device, control, initial)
+            fit = published(burst, settings, method, device, control, initial, checkpointing)
         case _:
             assert_never(settings.method)
     return (yield from supervise(fit, settings, control, should_stop))

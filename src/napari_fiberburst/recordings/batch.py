@@ -23,7 +23,7 @@ from napari_fiberburst.io.zarr import is_zarr
 from napari_fiberburst.pipeline.reconstruct import as_bundle
 from napari_fiberburst.recordings.outputs import identity
 from napari_fiberburst.recordings.tasks import TASKS, Made, Settings
-from napari_fiberburst.recordings.work import Doing, claim, is_begun, remove, room
+from napari_fiberburst.recordings.work import Doing, claim, forget, is_begun, remove, room
 from napari_fiberburst.results.batch import Row
 
 _ENDINGS = (*TIFF_ENDINGS, *VIDEO_ENDINGS, *ARCHIVE_ENDINGS)
@@ -202,8 +202,11 @@ def discard_batch(folder: Path, output: Path) -> None:
         There are no recordings.
     """
     if is_begun(output):
-        for name in (*(path.name for path in recordings_in(folder, output)), "report.html", "table.csv", "work.json"):
+        for path in recordings_in(folder, output):
+            remove(output / path.name)
+        for name in ("report.html", "table.csv"):
             remove(output / name)
+        forget(output)
 
 
 def _row(name: str, made: Made, place: Path, seconds: float) -> Row:

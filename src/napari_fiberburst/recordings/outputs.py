@@ -16,7 +16,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.results import check_free, check_place, write_whole
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.track import Track
-from napari_fiberburst.recordings.work import is_begun
+from napari_fiberburst.recordings.work import check_unused, is_begun
 
 ENDING = ".ome.zarr"
 _POSES, _TRACES, _TABLE = _BESIDE = (".poses.csv", ".traces.zarr", ".traces.csv")
@@ -30,7 +30,8 @@ def check_target(output: str | Path, what: str) -> Path:
     Raises
     ------
     OutputError
-        It has another ending, is there already, or its folder cannot be written.
+        It has another ending, is there already, or its folder cannot be written; or the folder of its work holds
+        something of others.
     """
     target = Path(output).resolve()  # workers may have another current folder
     if not target.name.endswith(ENDING):
@@ -40,6 +41,7 @@ def check_target(output: str | Path, what: str) -> Path:
         if not is_begun(work_of(target)):
             check_free(path)
     check_place(poses)
+    check_unused(work_of(target))  # it is removed once the work is done
     return target
 
 

@@ -7,6 +7,7 @@ same bits as work that was not, because no unit depends on the order in which ot
 import ctypes
 import errno
 import json
+import os
 import pickle
 import shutil
 import sys
@@ -24,10 +25,12 @@ from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.errors import ClusterError, FiberBurstError, FullDiskError, OutputError
 from napari_fiberburst.io.plain import read_json
-from napari_fiberburst.io.results import check_free, write_whole
+from napari_fiberburst.io.results import check_free, is_partial, write_whole
 
 # In the folder of work: what it is, and what it has begun to write outside.
 _IDENTITY, _OUTPUTS = "work.json", "outputs.json"
+# The command that has begun it, where one has.
+_COMMAND = "command.json"
 # A unit that fails by something else than what a user can mend, such as a file server that did not answer, is tried
 # again so many times.
 _RETRIES = 2
@@ -300,9 +303,56 @@ def claim(folder: Path, identity: dict[str, Any]) -> bool:
     return False
 
 
+def remember(folder: Path, words: Sequence[str]) -> None:
+    """Keep the words of the command that work was begun with, and where it was given."""
+    _write_json(folder / _COMMAND, {"words": list(words), "folder": str(Path.cwd())})
+
+
+def command_of(folder: Path) -> tuple[list[str], str]:
+    """Return the words of the command that work was begun with, and where it was given; no words where a script has.
+
+    Raises
+    ------
+    OutputError
+        What is kept of it is damaged.
+    """
+    if not (folder / _COMMAND).exists():
+        return [], ""
+    told = _told(folder / _COMMAND, dict)
+    words, place = told.get("words"), told.get("folder")
+    if not (isinstance(words, list) and all(isinstance(word, str) for word in words) and isinstance(place, str)):
+        raise OutputError(f"{folder / _COMMAND} is damaged; give the command again that the work was begun with")
+    return words, place
+
+
+def check_unused(folder: Path) -> None:
+    """Refuse a folder for work that somebody else uses.
+
+    Raises
+    ------
+    OutputError
+        It is no folder, or something is in it that is not of work.
+    """
+    if is_begun(folder) or not os.path.lexists(folder):
+        return
+    if not folder.is_dir():
+        raise OutputError(f"{folder} is no folder; choose another output, or move it")
+    others = [path.name for path in folder.iterdir() if not is_partial(path)]
+    if others:
+        raise OutputError(
+            f"{folder} holds something else, such as {others[0]}; choose a folder that is new or empty, or move that"
+        )
+
+
 def is_begun(folder: Path) -> bool:
     """Whether work was begun in a folder and is not finished."""
     return (folder / _IDENTITY).exists()
+
+
+def forget(folder: Path) -> None:
+    """Let a folder be one in which no work was begun."""
+    for name in (_IDENTITY, _OUTPUTS, _COMMAND):
+        remove(folder / name)
 
 
 def own(folder: Path, paths: Sequence[Path]) -> None:

@@ -68,11 +68,11 @@ def find_outliers(
     # A frame that is blurred is off everywhere, and a core at the rim that the model does not fit in every frame.
     known = torch.where(counted, size, torch.nan)
     of_frame, of_core = (known.nanmedian(dim=axis, keepdim=True).values.nan_to_num() / _MEDIAN_SIZE for axis in (1, 0))
-    coarse = Grid.around(points[counted], samples.pitch, 2 * samples.pitch).at(points)
     # The mean size, as a normal variable's standard deviation; capped, so that outliers do not make themselves usual.
-    there = _smooth(coarse, size.clamp(max=float(3 * usual)), weights) * math.sqrt(math.pi / 2)
+    there, looked = _smooth_over_frames(samples.pitch, points, size.clamp(max=float(3 * usual)), weights)
+    there *= math.sqrt(math.pi / 2)
     score = size / torch.maximum(torch.maximum(there, usual), torch.maximum(of_frame, of_core)).clamp_min(1e-12)
-    counted &= _is_shared(coarse, in_frame, weights)
+    counted &= _is_shared(in_frame, weights, looked)
     found = (score > far) & (size > least_size * samples.contrast) & counted
     if not bool(found.any()):
         return found
@@ -84,10 +84,12 @@ def find_outliers(
     return found | also
 
 
-def _is_shared(coarse: Sampling, in_frame: Sampling, weights: Tensor) -> Tensor:
-    """Return which samples (T, N) lie where enough frames have looked to say which of them is off."""
+def _is_shared(in_frame: Sampling, weights: Tensor, of_all: Tensor) -> Tensor:
+    """Return which samples (T, N) lie where enough frames have looked to say which of them is off.
+
+    `of_all` (T, N) is the weight there of all frames.
+    """
     of_one = torch.stack([in_frame(blur(in_frame.adjoint(weight), 1.0)) for weight in weights])
-    of_all: Tensor = coarse(blur(coarse.adjoint(weights), 1.0))
     return of_all > _LEAST_FRAMES * of_one
 
 
@@ -95,3 +97,27 @@ def _smooth(at: Sampling, values: Tensor, weights: Tensor) -> Tensor:
     """Return the local mean of scattered values, at their own places."""
     total, mass = blur(torch.stack([at.adjoint(values * weights), at.adjoint(weights)]), 1.0)
     return at(total / mass.clamp_min(1e-9)) * (at(mass) > 0)
+
+
+def _smooth_over_frames(spacing: float, points: Tensor, values: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the local mean of values (T, N) at points (T, N, 2) of the scene, and the weight there, both (T, N).
+
+    Frame by frame, because where samples lie on a grid takes many times the memory of their values.
+    """
+    counted = weights > 0
+    corners = torch.cat([_corners(points[number][used]) for number, used in enumerate(counted) if bool(used.any())])
+    grid = Grid.around(corners, spacing, 2 * spacing)
+    total, mass = torch.zeros(2, *grid.shape).to(values)
+    for number, weight in enumerate(weights):
+        at = grid.at(points[number])
+        total += at.adjoint(values[number] * weight)
+        mass += at.adjoint(weight)
+    total, mass = blur(torch.stack([total, mass]), 1.0)
+    smooth = torch.stack([total / mass.clamp_min(1e-9), mass])
+    mean, looked = torch.stack([grid.at(part).of_channels(smooth) for part in points]).unbind(dim=-1)
+    return mean, looked
+
+
+def _corners(points: Tensor) -> Tensor:
+    """Return the two corners (2, 2) of the box about finite points (N, 2)."""
+    return torch.stack([points.amin(dim=0), points.amax(dim=0)])
