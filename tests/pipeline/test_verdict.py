@@ -154,6 +154,13 @@ def test_single_cores_that_are_missed_do_not_spoil_an_image_whose_halves_agree()
     single[:9] = 20.0
     assert verdict(error=0.3, disagreement=0.08, core_misfit=single).quality == "good"
     assert verdict(error=0.3, disagreement=0.2, core_misfit=single).quality == "doubtful"
+
+
+@pytest.mark.parametrize("known", [{"misfit": 8.0}, {"structure": 0.3}], ids=str)
+def test_what_many_cores_have_in_common_is_not_of_single_cores(known):
+    single = np.full(300, 2.0, np.float32)
+    single[:9] = 20.0
+    assert verdict(error=0.3, disagreement=0.08, core_misfit=single, **known).quality == "doubtful"
     assert verdict(error=0.3, disagreement=0.08).quality == "doubtful"
 
 

@@ -49,10 +49,9 @@ class Grid:
     @classmethod
     def around(cls, points: Tensor, spacing: float, margin: float) -> "Grid":
         """Cover all finite points (..., 2) and a margin about them, pixels."""
-        flat = points.reshape(-1, 2)
-        flat = flat[torch.isfinite(flat).all(dim=1)]
-        x0, y0 = (flat.amin(dim=0) - margin).tolist()
-        x1, y1 = (flat.amax(dim=0) + margin).tolist()
+        corners = [corner for part in points.reshape(-1, *points.shape[-2:]) for corner in _corners_of(part)]
+        x0, y0 = (torch.stack(corners).amin(dim=0) - margin).tolist()
+        x1, y1 = (torch.stack(corners).amax(dim=0) + margin).tolist()
         return cls.over((x0, y0, x1, y1), spacing)
 
     def part_about(self, points: Tensor) -> tuple["Grid", tuple[slice, slice]]:
@@ -245,3 +244,9 @@ class _Corners:
         above = (1 - y) * inside
         weight = torch.stack([(1 - right) * above, right * above, (1 - right) * below, right * below])
         return cls(x, y, torch.stack([first, first + 1, first + columns, first + columns + 1]), weight)
+
+
+def _corners_of(points: Tensor) -> tuple[Tensor, ...]:
+    """Return two corners of the box about finite points (N, 2); none where there are none."""
+    finite = points[torch.isfinite(points).all(dim=1)]
+    return (finite.amin(dim=0), finite.amax(dim=0)) if len(finite) else ()

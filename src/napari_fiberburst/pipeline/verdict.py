@@ -30,8 +30,9 @@ _UNEVEN_FRAMES = 0.7
 # Ratio of the residuals of the worst cores, one in a hundred, to those of a typical one. Where frames are few, single
 # edges stand out in it, so it grows with the square of the above.
 _UNEVEN_CORES = 9.0
-# From this ratio on single cores make most of the error: their gains are off, or they lie at an edge.
-_SINGLE_CORES = 6.0
+# From this ratio on single cores make most of the error: their gains are off, or they lie at an edge. Not so where the
+# typical residual is as many standard deviations of the noise as the second number, or neighbours have it in common.
+_SINGLE_CORES, _MISFIT_OF_FEW = 6.0, 6.0
 # Correlation of residuals of neighbouring cores: what differs from the model over several cores makes it high. Frames
 # that are blurred in different directions make it negative, because an edge is then too bright on one side and too
 # dark on the other.
@@ -94,7 +95,8 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
     # NaN, a misfit that is not known, is no reason to take it for noise.
     is_more_than_noise = not registration.is_still and not fit.misfit <= _NOISE_ALONE
     allowed = _DOUBTFUL_ERROR * gaps if fit.is_noise_known else _DOUBTFUL_PIXELS
-    is_of_single_cores = fit.disagreement <= _AGREEMENT * gaps and fit.peak > _SINGLE_CORES
+    is_common = fit.misfit > _MISFIT_OF_FEW or (fit.is_noise_known and fit.structure > _STRUCTURE)
+    is_of_single_cores = fit.disagreement <= _AGREEMENT * gaps and fit.peak > _SINGLE_CORES and not is_common
     is_material = not is_of_single_cores and fit.error > _SMALL_ERROR * allowed
     if is_more_than_noise and not is_of_single_cores and fit.error > allowed:
         is_bad = fit.error > allowed * _BAD_ERROR / _DOUBTFUL_ERROR

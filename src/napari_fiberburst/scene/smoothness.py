@@ -100,10 +100,8 @@ def choose_smoothness(
         (H, W), a first scene on that grid: the window is laid where it has most structure.
     """
     window = liveliest(grid, scene, _WINDOW)
-    # What is drawn at random depends on how many frames there are, and those that take no part must not count.
-    there = torch.from_numpy(frames).to(points.device)
-    samples = replace(samples, values=samples.values[there], weights=samples.weights[there])
-    points, numbers = points[there], np.arange(len(frames))
+    samples, points = _in_window(samples, points, frames, window)
+    numbers = np.arange(len(frames))
     halves = [among_frames(half, samples) for half in (numbers[::2], numbers[1::2])]
 
     def equations_of(some: Samples) -> list[NormalEquations]:
@@ -133,6 +131,27 @@ def choose_smoothness(
     rehearsal = Rehearsal.of(window, samples, points, spectra.frequency[1:], power)
     equations = assemble(window, rehearsal.samples, points)
     return Smoothness(_least_error(rehearsal, equations, variance), agreement)
+
+
+def _in_window(
+    samples: Samples, points: Tensor, frames: NDArray[np.intp], window: Grid
+) -> tuple[Samples, Tensor]:
+    """Return the samples that look into a window in one of these frames, and where; without all other frames.
+
+    What is drawn at random depends on how many there are, and frames that take no part must not count.
+    """
+    looks = torch.zeros(len(samples.positions), dtype=torch.bool, device=points.device)
+    for number in frames.tolist():
+        looks |= window.of_looks(points[number]).inside & (samples.weights[number] > 0)
+    there = torch.from_numpy(frames).to(points.device)[:, None], looks.nonzero()[:, 0]
+    seen = replace(
+        samples,
+        positions=samples.positions[looks],
+        values=samples.values[there],
+        weights=samples.weights[there],
+        core_index=samples.core_index[looks],
+    )
+    return seen, points[there]
 
 
 def _without_mean(samples: Samples) -> Samples:
