@@ -15,6 +15,7 @@ import tifffile
 from napari_fiberburst import Bundle, Samples, load, open_recording, read_burst, reconstruct, sample
 from napari_fiberburst.io.pyramid import create_pyramid, write_frames
 from napari_fiberburst.io.video_writer import write_video
+from napari_fiberburst.pipeline.checkpoint import Checkpoint
 from napari_fiberburst.recordings.batch import read_settings
 from napari_fiberburst.simulation import simulate, simulate_recording
 from soak.trials import Count, wrong_with, wrong_with_burst
@@ -81,6 +82,11 @@ def targets(folder: Path) -> dict[str, Target]:
     reads("result", saved, lambda: load(saved, "cpu"), wrong_with)
     model = result.save(folder / "scene.fiberburst")
     reads("model", model, lambda: load(model, "cpu"), wrong_with)
+    kept_run = folder / "run.checkpoint"
+    reconstruct(
+        burst, encoding="fourier", features=4, scene_width=8, iterations=3, checkpoint=kept_run, checkpoint_every=1e-9
+    )
+    reads("checkpoint", kept_run, lambda: Checkpoint.load(kept_run), lambda run: None if run.step > 0 else "no steps")
     settings = folder / "batch.toml"
     settings.write_text("[recording]\nframe_rate = 20\n[video]\nwindow = 9\nstabilised = true\n")
     reads("settings", settings, lambda: read_settings(settings, "video"), lambda value: None)

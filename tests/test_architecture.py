@@ -29,7 +29,7 @@ ALLOWED = {
     "motion": BASE | {"coordinates", "operators", "steps", "stored", "bundle"},
     "scene": BASE | {"coordinates", "operators", "steps", "stored", "bundle", "motion", "quality"},
     "networks": RESULTS | {"coordinates", "operators", "device", "quality", *STEPS},
-    "pipeline": RESULTS | {"coordinates", "operators", "device", "steps", "networks", *STEPS},
+    "pipeline": RESULTS | {"coordinates", "operators", "device", "steps", "stored", "networks", "memory", *STEPS},
     "recordings": RESULTS | {"coordinates", "operators", "quality", "steps", "stored", "pipeline", *STEPS},
     "live": BASE | {"io", "simulation", "operators", "steps", "bundle", "motion", "pipeline"},
     "report": RESULTS | {"coordinates", "quality"},

@@ -9,6 +9,9 @@ from napari_fiberburst.errors import DeviceError
 
 logger = logging.getLogger(__name__)
 
+# What torch says in a RuntimeError like any other: on the CPU under Linux and Windows, and on Apple's GPUs.
+_NO_MEMORY = ("can't allocate memory", "not enough memory", "MPS backend out of memory")
+
 
 def find_device(name: str) -> torch.device:
     """Return the device called `name`; "auto" is the fastest kind there is: cuda, then mps, then cpu.
@@ -62,6 +65,13 @@ def missing_devices() -> dict[str, str]:
     if "mps" not in here:
         missing["mps"] = "only Apple computers with an Apple GPU have it, from macOS 12.3 on"
     return missing
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that there was no memory left, on the device or on the machine."""
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _NO_MEMORY)
 
 
 def free_memory(name: str) -> int | None:

@@ -21,6 +21,10 @@ class DeviceError(FiberBurstError):
     """The computing device asked for is not on this machine."""
 
 
+class MemoryLimitError(FiberBurstError):
+    """A run takes more memory than there is, or than it may take."""
+
+
 class OutputError(FiberBurstError):
     """A result cannot be written where it was asked to go, or a saved one cannot be read."""
 

@@ -1,17 +1,42 @@
-"""How much memory a run will take, told before it starts."""
+"""How much memory a run takes, told before it starts, and held to where that is asked for."""
 
+from typing import Literal
+
+from napari_fiberburst.errors import MemoryLimitError
 from napari_fiberburst.settings import NetworkMethod, PublishedMethod, Settings, SplineMethod
+from napari_fiberburst.settings.settings import bytes_of
 
-# Fitted to what `benchmarks/memory.py` measures, from above.
-_FIXED = 200 * 2**20
-_BYTES_PER_SAMPLE, _BYTES_PER_NODE, _BYTES_PER_UNIT = 12, 500, 10
+Kind = Literal["cores", "pixels"]
+# Fitted to what `benchmarks/memory.py` measures.
+_FIXED = 107e6
+_PER_VALUE, _PER_PIXEL, _PER_FURTHER_NODE = 18, 112, 300
+# Of a sample, and of each of its channels.
+_PER_SAMPLE = {"cores": (90, 67), "pixels": (47, 21)}
+# Of training: whatever the batch; and of a sample, as recorded or behind a bundle.
+_FIXED_OF_TRAINING, _PER_RECORDED, _PER_TAKEN = 190e6, 9, 71
+# Of a unit of the scene network for each point: of the first so many, and of further ones. glibc takes arrays below
+# 32 MiB from its heap, and does not fill all the holes there.
+_FIRST_UNITS, _PER_FIRST_UNIT, _PER_UNIT = 30e6, 14, 6.9
+# Behind a bundle, a core is seen by so many points of its footprint.
+_POINTS = {"cores": 7, "pixels": 1}
+# Samples to a pixel before the bundle is known: cores that lie close together, or what is lit of them.
+_USUAL = {"cores": 0.09, "pixels": 0.61}
 # A union canvas is as large as the motion; half a frame more on each axis is much.
 _UNION = 2.25
 _PUBLISHED_BATCHES = 8
+# Parts of a batch below this size would take longer than they save.
+_LEAST_PART = 256
 
 
-def estimate_memory(shape: tuple[int, int, int, int], settings: Settings) -> int:
-    """Return about how many bytes a run takes beside the burst as it came, rather too many than too few.
+def estimate_memory(
+    shape: tuple[int, int, int, int],
+    settings: Settings,
+    *,
+    kind: Kind | None = None,
+    samples: int | None = None,
+    parts: int = 1,
+) -> int:
+    """Return about how many bytes a run takes beside the burst, float32.
 
     Parameters
     ----------
@@ -19,20 +44,115 @@ def estimate_memory(shape: tuple[int, int, int, int], settings: Settings) -> int
         T, H, W and C of the burst.
     settings : Settings
         What it will be run with.
+    kind : str, optional
+        "cores" or "pixels", what the samples of the burst are; by default as asked for, or else cores.
+    samples : int, optional
+        How many a frame has; by default as many as of cores that lie close together, which is rather too many.
+    parts : int
+        In which batches of a network go through it.
 
     Examples
     --------
     >>> estimate_memory((20, 600, 600, 3), Settings()) // 2**20
-    618
+    443
     """
     frames, height, width, channels = shape
-    samples = frames * height * width * channels
     method = settings.method
-    is_union, units = False, 0
-    if isinstance(method, SplineMethod | NetworkMethod):
-        is_union = method.canvas == "union"
-    if isinstance(method, NetworkMethod | PublishedMethod):
-        batch = method.batch or height * width // _PUBLISHED_BATCHES
-        units = batch * method.scene_layers * method.scene_width
-    nodes = height * width * method.upsample**2 * (_UNION if is_union else 1)
-    return int(_FIXED + _BYTES_PER_SAMPLE * samples + _BYTES_PER_NODE * nodes + _BYTES_PER_UNIT * units)
+    if isinstance(method, PublishedMethod):
+        return int(_PER_RECORDED * frames * height * width + _of_training(method, height * width, 1, parts))
+    if kind is None:
+        kind = "pixels" if method.samples == "pixels" else "cores"
+    each = round(_USUAL[kind] * height * width) if samples is None else samples
+    union = _UNION if method.canvas == "union" else 1
+    finer = method.upsample**2 if isinstance(method, SplineMethod) else 1
+    further = height * width * max(0.0, finer * union - 1)
+    of_sample, of_channel = _PER_SAMPLE[kind]
+    aligning = (
+        _FIXED
+        + _PER_VALUE * frames * height * width
+        + _PER_PIXEL * height * width
+        + _PER_FURTHER_NODE * further
+        + (of_sample + of_channel * channels) * frames * each
+    )
+    if isinstance(method, SplineMethod):
+        return int(aligning)
+    training = _PER_TAKEN * frames * each + _of_training(method, height * width, _POINTS[kind], parts)
+    return int(max(aligning, training))
+
+
+def _of_training(method: NetworkMethod | PublishedMethod, frame: int, points: int, parts: int) -> float:
+    batch = method.batch or -(-frame // _PUBLISHED_BATCHES)
+    units = -(-batch // parts) * points * method.scene_layers * method.scene_width
+    first = min(units, _FIRST_UNITS)
+    return _FIXED_OF_TRAINING + _PER_FIRST_UNIT * first + _PER_UNIT * (units - first)
+
+
+class MemoryLimit:
+    """What a run may take, by `Settings.memory`.
+
+    Parameters
+    ----------
+    shape : (int, int, int, int)
+        T, H, W and C of the burst.
+    settings : Settings
+        What it is run with.
+    """
+
+    def __init__(self, shape: tuple[int, int, int, int], settings: Settings) -> None:
+        self._shape, self._settings = shape, settings
+        self._most = None if settings.memory is None else bytes_of(settings.memory)
+
+    def allows(self, kind: Kind, samples: int) -> bool:
+        """Whether a run with so many samples a frame fits, in as many parts as it takes."""
+        return self._parts(kind, samples) is not None
+
+    def parts(self, kind: Kind | None = None, samples: int | None = None) -> int:
+        """Return the least number of parts of a network's batches with which a run fits, a power of two.
+
+        Parameters
+        ----------
+        kind, samples
+            As those of `estimate_memory`.
+
+        Raises
+        ------
+        MemoryLimitError
+            It does not fit in any number of parts.
+        """
+        parts = self._parts(kind, samples)
+        if parts is not None:
+            return parts
+        needed = estimate_memory(self._shape, self._settings, kind=kind, samples=samples, parts=self._most_parts)
+        assert self._most is not None
+        raise MemoryLimitError(
+            f"this run takes about {in_words(needed)} beside the burst, and memory allows {in_words(self._most)}; "
+            'allow more, crop the burst, take fewer frames, lower the upsampling, or take observation="cores"'
+        )
+
+    @property
+    def _most_parts(self) -> int:
+        _, height, width, _ = self._shape
+        method = self._settings.method
+        batch = 0 if isinstance(method, SplineMethod) else method.batch or height * width // _PUBLISHED_BATCHES
+        return max(1, batch // _LEAST_PART)
+
+    def _parts(self, kind: Kind | None, samples: int | None) -> int | None:
+        parts = 1
+        while self._most is not None:
+            if estimate_memory(self._shape, self._settings, kind=kind, samples=samples, parts=parts) <= self._most:
+                break
+            if parts >= self._most_parts:
+                return None
+            parts *= 2
+        return parts
+
+
+def in_words(size: int) -> str:
+    """Return bytes as a person would say them.
+
+    Examples
+    --------
+    >>> in_words(1_234_567_890), in_words(45_600_000)
+    ('1.2 GB', '46 MB')
+    """
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import GUESSED_GAINS, Bundle
@@ -257,13 +259,19 @@ def sample_cores(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Sa
     )
 
 
+def lit_pixels(bundle: Bundle) -> NDArray[np.bool_]:
+    """Return which pixels of a frame (H, W) are samples where pixels are."""
+    lit: NDArray[np.bool_] = (bundle.labels < len(bundle.centres)) & (bundle.transmission > _LEAST_TRANSMISSION)
+    return lit
+
+
 def sample_pixels(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Samples:
     """Take every lit pixel of frames (T, H, W, C) as a sample of one point of the scene.
 
     Saturated pixels have no weight, nor have frames that show nothing.
     """
     known = BundleTensors.of(bundle, acquisition, frames.device)
-    lit = known.own & (known.transmission > _LEAST_TRANSMISSION)
+    lit = torch.from_numpy(lit_pixels(bundle)).to(frames.device)
     passed, labels = known.transmission[lit], known.labels[lit]
     light = frames[:, lit]
     gains, offsets = (known.per_channel(part, frames.shape[-1])[labels] for part in (known.gains, known.offsets))

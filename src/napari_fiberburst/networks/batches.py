@@ -4,8 +4,8 @@ As published, of all pixels of all frames; behind a calibrated bundle, of its sa
 """
 
 import math
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,6 +50,15 @@ class Batch(NamedTuple):
     frames: Tensor
     intensities: Tensor
     weights: Tensor | None = None
+
+    @property
+    def weight(self) -> Tensor:
+        """How much all samples count, a scalar."""
+        return self.frames.new_tensor(len(self.frames)) if self.weights is None else self.weights.sum()
+
+    def split(self, parts: int) -> Iterator["Batch"]:
+        """Yield so many parts of about the same size, in turn."""
+        yield from (Batch(*of) for of in zip(*(_split(value, parts) for value in self), strict=True))
 
 
 class _Favoured:
@@ -237,3 +246,7 @@ def shuffled(count: int, seed: int, epoch: int, device: torch.device) -> Tensor:
     """Return the numbers up to `count` in the order of an epoch."""
     generator = torch.Generator(device).manual_seed(seed + _SEED_STRIDE * epoch)
     return torch.randperm(count, generator=generator, device=device)
+
+
+def _split(values: Tensor | None, parts: int) -> Sequence[Any]:
+    return [None] * parts if values is None else values.tensor_split(parts)

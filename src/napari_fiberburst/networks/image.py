@@ -1,5 +1,6 @@
 """The fitted field as a compressed representation of the burst: drawn at any size, kept, continued."""
 
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -9,9 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.coordinates import in_pixels, relative_to, unit_from_pixel
+from napari_fiberburst.device import is_out_of_memory
 from napari_fiberburst.networks.field import JointField
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import NetworkMethod, TrainedMethod
+
+logger = logging.getLogger(__name__)
 
 # Points drawn at a time: the widest layer's activations of this many take some 50 MB.
 _CHUNK = 16_384
@@ -50,6 +54,7 @@ class Representation:
         self.frame_shape = frame_shape
         self.optimizer_state = optimizer_state
         self.drawn = drawn
+        self._chunk = _CHUNK
         self._unit_from_pixel = unit_from_pixel(frame_shape)
 
     def render(self, points: NDArray[np.float64], frame: int) -> NDArray[np.float32]:
@@ -128,11 +133,19 @@ class Representation:
     ) -> NDArray[np.float32]:
         device = self.field.motion.times.device
         unit = points.reshape(-1, 2) * np.diag(self._unit_from_pixel)[:2] + self._unit_from_pixel[:2, 2]
-        parts = []
-        with torch.no_grad():
-            for start in range(0, len(unit), _CHUNK):
-                chunk = torch.from_numpy(unit[start : start + _CHUNK].astype(np.float32)).to(device)
-                frames = torch.full((len(chunk),), frame, device=device)
-                parts.append(function(chunk, frames).cpu())
+        parts: list[Tensor] = []
+        start = 0
+        while start < len(unit):
+            chunk = torch.from_numpy(unit[start : start + self._chunk].astype(np.float32)).to(device)
+            try:
+                with torch.no_grad():
+                    parts.append(function(chunk, torch.full((len(chunk),), frame, device=device)).cpu())
+                start += len(chunk)
+                continue
+            except (MemoryError, RuntimeError) as error:
+                if not is_out_of_memory(error) or len(chunk) < 2:
+                    raise
+            self._chunk = len(chunk) // 2
+            logger.warning("memory ran out; %d points are drawn at a time from now on", self._chunk)
         values: NDArray[np.float32] = torch.cat(parts).numpy().reshape(*points.shape[:2], -1)
         return values

@@ -1,5 +1,6 @@
 """One fit in the making: the joint field, the samples it is fitted to, and Adam."""
 
+import logging
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,6 +13,7 @@ from torch import Tensor
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.coordinates import unit_from_pixel
 from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.device import is_out_of_memory
 from napari_fiberburst.errors import SettingsError
 from napari_fiberburst.networks.batches import Batch, BundleStream, PixelStream
 from napari_fiberburst.networks.field import JointField
@@ -20,7 +22,8 @@ from napari_fiberburst.networks.motion import AlignedField
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.scene.image import SplineImage
 from napari_fiberburst.settings import Encoding, Fourier, Hash, TrainedMethod
-from napari_fiberburst.stored import Arrays
+
+logger = logging.getLogger(__name__)
 
 # As published. Every step sees this part of one frame's worth of pixels, drawn from all frames.
 BATCHES_PER_FRAME = 8
@@ -79,6 +82,8 @@ class Problem:
         Where to go on from; the samples go on from where its run ended, too.
     behind : BehindBundle, optional
         The samples of the bundle and where they lie; without, the frames are fitted as they are, as published.
+    parts : int
+        In which batches go through the networks, to the same gradients but for rounding; more need less memory.
 
     Raises
     ------
@@ -89,6 +94,8 @@ class Problem:
     ----------
     method : NetworkMethod or PublishedMethod
         The method with what it left open of its encoding, learning rate and batch chosen.
+    parts : int
+        As given, or more where memory has run out.
     """
 
     # Whatever the caller's thread has set, the fit needs gradients, and tensors that can have them.
@@ -102,6 +109,7 @@ class Problem:
         seed: int = 0,
         initial: Reconstruction | None = None,
         behind: BehindBundle | None = None,
+        parts: int = 1,
     ) -> None:
         _, height, width, _ = burst.shape
         self.frame_shape = (height, width)
@@ -114,6 +122,7 @@ class Problem:
             self.samples = BundleStream(behind.samples, behind.held_out, seed, behind.offsets)
             self.batch = min(self.batch, self.samples.count)
             start = _unit_start(behind)
+        self.parts = parts
         self.learning_rate = method.learning_rate or _usual_rate(method)
         self.method = replace(
             method,
@@ -124,8 +133,8 @@ class Problem:
         self.field = JointField(self.method, burst.shape, seed=seed, start=start).to(device)
         registered = isinstance(self.field.motion, AlignedField)
         self._paces = (1.0, _PACE_OF_REGISTERED_MOTION if registered else 1.0)
-        parts = [{"params": part.parameters()} for part in (self.field.scene, self.field.motion)]
-        self.optimizer = torch.optim.Adam(parts, lr=self.learning_rate, betas=BETAS)
+        groups = [{"params": part.parameters()} for part in (self.field.scene, self.field.motion)]
+        self.optimizer = torch.optim.Adam(groups, lr=self.learning_rate, betas=BETAS)
         self.set_learning_rate(self.learning_rate)
         if initial is not None:
             self._go_on_from(initial, burst)
@@ -134,16 +143,34 @@ class Problem:
     def step(self) -> Tensor:
         """Take one step of Adam on a fresh batch; return the loss before it, still on the device."""
         batch = self.samples.draw(self.batch)
-        with torch.enable_grad():
-            loss = self._misfit(batch)
-            points = batch.points if batch.points.ndim == 2 else batch.points[:, 0]
-            roughness = self.field.motion.roughness(points, batch.frames)
-            if roughness is not None:
-                loss = loss + roughness
-            self.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+        while True:
+            try:
+                loss = self._loss_and_gradients(batch)
+                break
+            except (MemoryError, RuntimeError) as error:
+                if not is_out_of_memory(error) or 2 * self.parts > len(batch.frames):
+                    raise
+            # Out of the handler, so that the error does not hold what is to be given back.
+            self.parts *= 2
+            logger.warning("memory ran out; batches go through the networks in %d parts from now on", self.parts)
         self.optimizer.step()
-        return loss.detach()
+        return loss
+
+    def _loss_and_gradients(self, batch: Batch) -> Tensor:
+        """Return the loss of a batch, and leave its gradients, summed over parts of which one is held at a time."""
+        self.optimizer.zero_grad()
+        count, whole = len(batch.frames), batch.weight
+        total = torch.zeros((), device=batch.frames.device)
+        for part in batch.split(self.parts):
+            with torch.enable_grad():
+                loss = self._misfit(part) * (part.weight / whole)
+                points = part.points if part.points.ndim == 2 else part.points[:, 0]
+                roughness = self.field.motion.roughness(points, part.frames)
+                if roughness is not None:
+                    loss = loss + roughness * (len(part.frames) / count)
+                loss.backward()  # type: ignore[no-untyped-call]
+            total += loss.detach()
+        return total
 
     def held_out_rmse(self) -> float | None:
         """Return the root mean square error, intensities in [0, 1], of samples that were left out; None without any."""
@@ -192,7 +219,7 @@ class Problem:
         self.optimizer.load_state_dict(optimizer)
         self.samples.drawn = drawn
 
-    def stored(self, state: State) -> Arrays:
+    def stored(self, state: State) -> dict[str, NDArray[Any]]:
         """Return the networks and Adam's moments of a state, by name, as a file can hold them."""
         field, optimizer, _ = state
         moments = {
@@ -203,7 +230,7 @@ class Problem:
         return {name: value.cpu().numpy() for name, value in (field | moments).items()}
 
     @torch.inference_mode(False)
-    def state_from(self, stored: Arrays, drawn: int) -> State:
+    def state_from(self, stored: dict[str, NDArray[Any]], drawn: int) -> State:
         """Return the state that arrays stand for, as `stored` has given them.
 
         Raises

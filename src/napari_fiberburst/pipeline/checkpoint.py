@@ -21,7 +21,7 @@ from napari_fiberburst.stored import Arrays, Stored
 ENDING = ".checkpoint"
 SECONDS_BETWEEN = 60.0
 # Settings that a run may go on with others of.
-_MAY_DIFFER = ("device", "time_budget", "preview_every")
+_MAY_DIFFER = ("device", "time_budget", "preview_every", "memory")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

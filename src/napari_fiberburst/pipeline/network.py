@@ -16,6 +16,7 @@ from napari_fiberburst.control import Control, Region
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.memory import MemoryLimit
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.training import BehindBundle, Problem, State
 from napari_fiberburst.pipeline.checkpoint import Checkpoint, Checkpointing
@@ -88,7 +89,8 @@ class NetworkFit:
         self._keeper = keeper
         self._burst, self._requested, self._method, self._device = burst, requested, method, device
         self._control, self._initial = control, initial
-        self._aligned = SplineFit(burst, requested, method.alignment, device, given)
+        self._limit = MemoryLimit(burst.shape, requested)
+        self._aligned = SplineFit(burst, requested, method.alignment, device, given, self._limit)
         self._training: Training | None = None
 
     def steps(self, clock: Clock) -> Generator[Snapshot | None, None, Ending]:
@@ -119,7 +121,13 @@ class NetworkFit:
         )
         method = replace(self._method, samples=fitted.samples.kind)
         problem = Problem(
-            self._burst, method, self._device, seed=self._requested.seed, initial=self._initial, behind=behind
+            self._burst,
+            method,
+            self._device,
+            seed=self._requested.seed,
+            initial=self._initial,
+            behind=behind,
+            parts=self._limit.parts(samples.kind, len(samples.positions)),
         )
         self._training = Training(
             self._burst, self._requested, problem, self._device, self._control, self._initial, self._keeper, fitted
@@ -142,7 +150,8 @@ def published(
     keeper: Checkpointing | None,
 ) -> "Training":
     """Return a fit of networks to the frames as they are; the parameters are those of `NetworkFit`."""
-    problem = Problem(burst, method, device, seed=requested.seed, initial=initial)
+    parts = MemoryLimit(burst.shape, requested).parts()
+    problem = Problem(burst, method, device, seed=requested.seed, initial=initial, parts=parts)
     return Training(burst, requested, problem, device, control, initial, keeper)
 
 

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.control import Control
 from napari_fiberburst.data.burst import Burst
-from napari_fiberburst.device import find_device, settle_threads
-from napari_fiberburst.errors import SettingsError
+from napari_fiberburst.device import find_device, is_out_of_memory, settle_threads
+from napari_fiberburst.errors import MemoryLimitError, SettingsError
 from napari_fiberburst.io import read_burst
+from napari_fiberburst.memory import MemoryLimit, estimate_memory, in_words
 from napari_fiberburst.pipeline.checkpoint import SECONDS_BETWEEN, Checkpointing, check_kept, told_by
 from napari_fiberburst.pipeline.network import NetworkFit, published
 from napari_fiberburst.pipeline.spline import SplineFit
@@ -113,6 +114,8 @@ def reconstruct(
         The frames are not a usable burst.
     SettingsError
         A setting is unknown, out of range, or does not apply to the choice made.
+    MemoryLimitError
+        The run takes more memory than ``memory="4 GB"`` allows, or than there is.
     DeviceError
         The device is not on this machine.
     OutputError
@@ -245,14 +248,23 @@ def iterate(
     fit: Fit
     match settings.method:
         case SplineMethod() as method:
-            fit = SplineFit(burst, settings, method, device, bundle)
+            fit = SplineFit(burst, settings, method, device, bundle, MemoryLimit(burst.shape, settings))
         case NetworkMethod() as method:
             fit = NetworkFit(burst, settings, method, device, control, initial, bundle, checkpointing)
         case PublishedMethod() as method:
             fit = published(burst, settings, method, device, control, initial, checkpointing)
         case _:
             assert_never(settings.method)
-    return (yield from supervise(fit, settings, control, should_stop))
+    try:
+        return (yield from supervise(fit, settings, control, should_stop))
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        needed = in_words(estimate_memory(burst.shape, settings))
+        raise MemoryLimitError(
+            f"memory ran out ({error}); such a run takes about {needed} beside the burst: crop the burst, take fewer "
+            "frames, lower the upsampling, or let other programs end"
+        ) from error
 
 
 def _check_bundle(settings: Settings, bundle: object) -> None:

@@ -6,6 +6,7 @@ import torch
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.memory import MemoryLimit
 from napari_fiberburst.pipeline.again import Again
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.outcome import Order
@@ -34,14 +35,22 @@ class SplineFit:
         Where.
     given : Bundle, optional
         The bundle, where it is known.
+    limit : MemoryLimit, optional
+        What the run may take.
     """
 
     def __init__(
-        self, burst: Burst, requested: Settings, method: SplineMethod, device: torch.device, given: Bundle | None
+        self,
+        burst: Burst,
+        requested: Settings,
+        method: SplineMethod,
+        device: torch.device,
+        given: Bundle | None,
+        limit: MemoryLimit | None = None,
     ) -> None:
         self._burst = burst
         self._order = Order(acquisition=burst.acquisition, requested=requested, method=method, device=device)
-        self._stages = Stages(burst, method, device, seed=requested.seed, given=given)
+        self._stages = Stages(burst, method, device, seed=requested.seed, given=given, limit=limit)
         self._losses: list[float] = []
         self._fitted: Fitted | None = None
         self._aligned: Fitted | None = None

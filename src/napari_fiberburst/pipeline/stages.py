@@ -19,9 +19,18 @@ from napari_fiberburst.bundle.field import find_marks, widened
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
-from napari_fiberburst.bundle.samples import Samples, in_grey, only_exposed, sample_cores, sample_pixels, shows_detail
+from napari_fiberburst.bundle.samples import (
+    Samples,
+    in_grey,
+    lit_pixels,
+    only_exposed,
+    sample_cores,
+    sample_pixels,
+    shows_detail,
+)
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.errors import BurstError
+from napari_fiberburst.memory import MemoryLimit
 from napari_fiberburst.motion.places import places_with_gains, split_by_place, with_common_gains, with_gains_by_place
 from napari_fiberburst.motion.register import refining, registering
 from napari_fiberburst.motion.registration import Registration, unregistered
@@ -70,7 +79,14 @@ class Stages:
     """
 
     def __init__(
-        self, burst: Burst, method: SplineMethod, device: torch.device, *, seed: int = 0, given: Bundle | None = None
+        self,
+        burst: Burst,
+        method: SplineMethod,
+        device: torch.device,
+        *,
+        seed: int = 0,
+        given: Bundle | None = None,
+        limit: MemoryLimit | None = None,
     ) -> None:
         if burst.shape[0] < 2 and given is None:
             raise BurstError(
@@ -78,7 +94,7 @@ class Stages:
                 "apart; give a bundle (Bundle.from_image, or reconstruct(burst).bundle), or open at least 2 frames as "
                 "one (time, height, width) stack"
             )
-        self._burst, self._method, self._seed, self._given = burst, method, seed, given
+        self._burst, self._method, self._seed, self._given, self._limit = burst, method, seed, given, limit
         self._scenes = Scenes(burst.acquisition, method, seed)
         self._frames = torch.from_numpy(burst.frames).to(device)
         self._grey = in_grey(self._frames)
@@ -290,7 +306,12 @@ class Stages:
         """Measure the transmission anew, decide between cores and pixels, and refine motion and gains by those."""
         outliers = self._outliers(fitted)
         bundle, registration = remeasured(fitted.bundle, fitted.registration, self._grey, self._burst)
-        if self._kind(bundle, registration) == "pixels":
+        kind = self._kind(bundle, registration)
+        if kind == "pixels" and not self._has_room_for_pixels(bundle):
+            kind = "cores"
+            text = "memory does not allow for the detail that frames show inside cores: one value a core was taken"
+            fitted = replace(fitted, notes=(*fitted.notes, _warned(text)))
+        if kind == "pixels":
             samples = sample_pixels(self._frames, bundle, self._burst)
         else:
             samples = self._cores(bundle, self._frames)
@@ -350,8 +371,19 @@ class Stages:
         cores = self._cores(bundle, self._grey[..., None]).weighted(torch.from_numpy(registration.used))
         return "pixels" if shows_detail(self._grey, bundle, self._burst, cores, registration.predicted) else "cores"
 
+    def _has_room_for_pixels(self, bundle: Bundle) -> bool:
+        """Whether pixels can be the samples; where nothing else can, that is an error."""
+        if self._limit is None:
+            return True
+        lit = int(lit_pixels(bundle).sum())
+        if self._method.samples == "pixels" or not bundle.is_resolved:
+            self._limit.parts("pixels", lit)
+        return self._limit.allows("pixels", lit)
+
     def _cores(self, bundle: Bundle, frames: Tensor) -> Samples:
         """Return the samples of whole cores of all frames, in colour or grey; those of the last bundle are kept."""
+        if self._limit is not None and bundle.is_resolved:
+            self._limit.parts("cores", len(bundle.centres))
         if self._taken is None or self._taken[0] is not bundle:
             self._taken = bundle, {}
         kept, channels = self._taken[1], frames.shape[-1]

@@ -24,7 +24,7 @@ from napari_fiberburst.settings import (
 # plugin itself decides, and the result card turns.
 _FIRST = ("smoothness", "upsample", "canvas", "fill", "iterations", "time_budget", "device")
 _METHOD_FIRST = ("sigma", "learning_rate")
-_NOT_SHOWN = ("preview_every", "leave_out")
+_NOT_SHOWN = ("preview_every", "leave_out", "memory")
 _LIVE = ("sigma", "learning_rate")
 _BOLD = "font-weight: bold;"
 _DEVICES = ("auto", "cpu", "cuda", "mps")

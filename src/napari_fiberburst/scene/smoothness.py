@@ -133,9 +133,7 @@ def choose_smoothness(
     return Smoothness(_least_error(rehearsal, equations, variance), agreement)
 
 
-def _in_window(
-    samples: Samples, points: Tensor, frames: NDArray[np.intp], window: Grid
-) -> tuple[Samples, Tensor]:
+def _in_window(samples: Samples, points: Tensor, frames: NDArray[np.intp], window: Grid) -> tuple[Samples, Tensor]:
     """Return the samples that look into a window in one of these frames, and where; without all other frames.
 
     What is drawn at random depends on how many there are, and frames that take no part must not count.

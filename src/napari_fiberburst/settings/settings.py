@@ -1,5 +1,6 @@
 """Frozen settings, as values and as JSON. Standard library only, so that reading them costs little."""
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, TypeVar
@@ -12,7 +13,9 @@ from napari_fiberburst.settings.parameter import Parameter, check, parameter, pa
 
 Chosen = TypeVar("Chosen")
 # None is a choice there, not an open question: no limit, and no previews.
-_MAY_BE_NONE = ("time_budget", "preview_every")
+_MAY_BE_NONE = ("time_budget", "preview_every", "memory")
+# Bytes of each unit.
+_UNITS = {"MB": 10**6, "GB": 10**9, "TB": 10**12, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,11 +45,19 @@ class Settings:
         above=0,
     )
 
+    memory: str | None = parameter(
+        None,
+        'Memory that a run may take beside the burst, such as "4 GB"; a network then sees its batches in parts, and '
+        "what cannot fit is refused. None sets no limit.",
+    )
+
     def __post_init__(self) -> None:
         if type(self.method) not in METHODS.values():
             names = ", ".join(method.__name__ for method in METHODS.values())
             raise SettingsError(f"method must be one of {names}; got {self.method!r}")
         check(self)
+        if self.memory is not None:
+            bytes_of(self.memory)
 
     @property
     def motions(self) -> Mapping[str, type[Motion]]:
@@ -111,6 +122,26 @@ class Settings:
         """Return the dataclasses that hold the parameters."""
         parts = (getattr(self.method, part, None) for part in ("motion", "encoding"))
         return (*(part for part in parts if part is not None), self.method, self)
+
+
+def bytes_of(memory: str) -> int:
+    """Return how many bytes a text such as "4 GB" stands for.
+
+    Raises
+    ------
+    SettingsError
+        It is no positive number with a unit.
+
+    Examples
+    --------
+    >>> bytes_of("4 GB"), bytes_of("1.5GiB")
+    (4000000000, 1610612736)
+    """
+    told = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([A-Za-z]+)\s*", memory)
+    size = 0 if told is None else int(float(told[1]) * _UNITS.get(told[2], 0))
+    if size <= 0:
+        raise SettingsError(f"memory must be a positive number with a unit, {', '.join(_UNITS)}; got {memory!r}")
+    return size
 
 
 def misplaced(name: str, settings: Settings) -> SettingsError:
