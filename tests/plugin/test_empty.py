@@ -8,6 +8,7 @@ from npe2 import PluginManifest
 from qtpy.QtWidgets import QFileDialog
 from skimage.io import imsave
 
+from napari_fiberburst import reconstruct
 from napari_fiberburst.simulation import simulate
 
 MILLISECONDS = 60_000
@@ -70,6 +71,21 @@ def test_a_burst_is_opened_by_the_reader_of_the_command_line(open_dock, qtbot, m
         burst = source.read()
         assert (burst.pixel_size, burst.unit, burst.channel_names) == ((0.5, 0.25), "µm", ("red", "green"))
         assert burst.times is not None
+
+
+def test_a_saved_result_opens_as_the_layers_of_its_run_and_is_not_taken_for_a_burst(
+    open_dock, qtbot, monkeypatch, burst_layer, tmp_path
+):
+    burst = simulate("histology", shape=(40, 48), frames=4, pitch=4.0).burst
+    path = reconstruct(burst, preset="paper", iterations=1, batch=64).save(tmp_path / "tissue.fiberburst")
+    viewer, dock = open_dock(burst_layer)
+    asked = []
+    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *words: asked.append(words) or (str(path), ""))
+    dock.input.burst_button.click()
+    qtbot.waitUntil(lambda: len(viewer.layers) > 1, timeout=MILLISECONDS)
+    assert "*.fiberburst" in asked[0][3]
+    assert viewer.layers[1].name == "tissue: image"
+    assert dock.input.burst.value is burst_layer
 
 
 def test_a_file_that_is_no_burst_is_refused_in_words(open_dock, qtbot, tmp_path):

@@ -1,5 +1,6 @@
 """The report of a run, from its card."""
 
+from dataclasses import replace
 from html import escape, unescape
 from pathlib import Path
 from threading import Event
@@ -47,6 +48,17 @@ def save(dock, qtbot):
     box.button.click()
     qtbot.waitUntil(lambda: box.button.isEnabled(), timeout=MILLISECONDS)
     return box.words.text()
+
+
+def test_a_place_is_suggested_beside_the_burst(ran, monkeypatch, tmp_path):
+    dock, run = ran
+    asked = []
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *words: asked.append(words[2]) or ("", ""))
+    box = dock.picture.display.card.report
+    box.button.click()
+    run.source = replace(run.source, path=str(tmp_path / "lung.tif"))
+    box.button.click()
+    assert asked == [f"{run.name} report.html", str(tmp_path / f"{run.name} report.html")]
 
 
 def test_the_report_of_the_run_that_is_shown_is_written_where_it_is_wanted(ran, run_through, qtbot, answer, tmp_path):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from napari.components import ViewerModel
@@ -13,13 +14,19 @@ from qtpy.QtWidgets import QFileDialog, QLabel, QMenu, QPushButton, QVBoxLayout,
 from superqt.utils import create_worker
 
 from napari_fiberburst.io.archive import ARCHIVE_ENDINGS
+from napari_fiberburst.io.results import MODEL_ENDING, is_model
 from napari_fiberburst.io.tiff import TIFF_ENDINGS
 from napari_fiberburst.io.video_container import VIDEO_ENDINGS
-from napari_fiberburst.plugin.contributions import PLUGIN, LayerData, read
+from napari_fiberburst.plugin import METADATA_KEY
+from napari_fiberburst.plugin.contributions import PLUGIN, LayerData, read, read_model
 from napari_fiberburst.plugin.problems import why
 from napari_fiberburst.plugin.sections import row_of
 
-_FILES = " ".join(f"*{ending}" for ending in (*TIFF_ENDINGS, *ARCHIVE_ENDINGS, *VIDEO_ENDINGS))
+_BURSTS, _MODELS = (
+    " ".join(f"*{ending}" for ending in endings)
+    for endings in ((*TIFF_ENDINGS, *ARCHIVE_ENDINGS, *VIDEO_ENDINGS), (MODEL_ENDING,))
+)
+_KINDS = f"All that opens here ({_BURSTS} {_MODELS});;Bursts and recordings ({_BURSTS});;Saved results ({_MODELS})"
 _INVITATION = (
     "Open a burst, 10 to 20 frames that moved a little, or a recording of any length. Or drop it on the window."
 )
@@ -70,14 +77,13 @@ class EmptyBox(QWidget):
         self.folder_button.clicked.connect(self._ask_for_folder)
 
     def open(self, path: str) -> None:
-        """Open a burst as a layer, with what its file says of it; or say why not."""
-        self._load(partial(read, path), f"Opening {path}")
+        """Open a burst as a layer, with what its file says of it, or a model as those of its run; or say why not."""
+        opens = read_model if is_model(Path(path)) else read
+        self._load(partial(opens, path), f"Opening {path}")
 
     def ask_for_file(self) -> None:
         """Let the user choose a file, and open it."""
-        path, _ = QFileDialog.getOpenFileName(
-            self, "Open a burst or a recording", "", f"Bursts and recordings ({_FILES})"
-        )
+        path, _ = QFileDialog.getOpenFileName(self, "Open a burst, a recording or a saved result", "", _KINDS)
         if path:
             self.open(path)
 
@@ -104,7 +110,8 @@ class EmptyBox(QWidget):
         layers = [Layer.create(data, look, kind) for data, look, kind in opened]
         for layer in layers:
             self._viewer.add_layer(layer)
-        self.opened.emit(layers)
+        if "reconstruction" not in layers[0].metadata.get(METADATA_KEY, {}):  # a saved result is no burst
+            self.opened.emit(layers)
 
     def _take_error(self, error: Exception) -> None:
         problem = why(error, "a burst could not be opened")

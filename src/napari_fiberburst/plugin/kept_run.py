@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_fiberburst.errors import BundleError
@@ -84,6 +85,11 @@ class KeptRun:
                 f"{scores.motion_error:.2g} px"
             )
         return tuple(filter(None, lines))
+
+    def beside(self, ending: str) -> str:
+        """Return a place for what is written of it, called by its name: where its burst lies, if that is a file."""
+        name = f"{self.name} {ending}"
+        return name if self.source.path is None else str(Path(self.source.path).absolute().with_name(name))
 
     @property
     def row(self) -> tuple[str | float, ...]:

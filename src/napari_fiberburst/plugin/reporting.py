@@ -73,7 +73,7 @@ class ReportBox(QWidget):
         run = self._run
         if run is None:
             return
-        path, _ = QFileDialog.getSaveFileName(self, f"Save {what}", f"{run.name} {ending}", kinds)
+        path, _ = QFileDialog.getSaveFileName(self, f"Save {what}", run.beside(ending), kinds)
         if not path:
             return
         self._writing, self._what = run, what

@@ -60,7 +60,7 @@ class SaveButtons(QWidget):
     def _ask_for_motion(self) -> None:
         run = self._run
         if run is not None:
-            path = self._ask("Save homographies", f"{run.name} homographies.csv", "CSV (*.csv);;JSON (*.json)")
+            path = self._ask("Save homographies", run.beside("homographies.csv"), "CSV (*.csv);;JSON (*.json)")
             if path:
                 save_homographies(run, path)
 

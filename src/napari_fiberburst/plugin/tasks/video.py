@@ -65,9 +65,12 @@ class VideoTask(LongTask):
         self.frames_behind.setRange(0, _MOST_FRAMES)
         self.frames_behind.setSpecialValueText("auto")
         self.frames_behind.setAccessibleName("frames behind each")
-        self.frames_behind.setToolTip("How many frames stand behind each; auto, as the motion asks for.")
+        self.frames_behind.setToolTip(
+            "How many frames in a row make one of the video: more are sharper, and show less of what changes; auto, as "
+            "the motion asks for."
+        )
         self.stabilised.setToolTip("Frames move over a scene that stands still; else they are shown as they lie.")
-        return {"window": self.frames_behind, "stabilised": self.stabilised}
+        return {"frames behind each": self.frames_behind, "stabilised": self.stabilised}
 
     def paths_of(self, result: "Video") -> tuple[Path, ...]:
         """Return the video."""
