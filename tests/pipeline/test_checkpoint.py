@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from napari_fiberburst import Control, FiberBurstError, reconstruct
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.networks.training import Problem
 from napari_fiberburst.pipeline.checkpoint import Checkpoint
 from napari_fiberburst.simulation import simulate
@@ -77,6 +78,24 @@ def test_a_stopped_run_is_kept_where_it_stopped(burst, tmp_path, same):
     assert stopped.ending == "stopped"
     assert Checkpoint.load(path).step == len(stopped.losses)
     same(reconstruct(burst, **choices), reconstruct(burst, **METHODS["network"]))
+
+
+def test_a_disk_that_is_full_does_not_end_the_run(burst, tmp_path, monkeypatch, caplog, same):
+    path, save, tries = tmp_path / "run.checkpoint", Checkpoint.save, []
+
+    def full(checkpoint, path):
+        tries.append(checkpoint.step)
+        if len(tries) > 1:
+            raise OutputError(f"{path} cannot be written (No space left on device); choose another place")
+        return save(checkpoint, path)
+
+    monkeypatch.setattr(Checkpoint, "save", full)
+    same(
+        reconstruct(burst, **METHODS["network"], checkpoint=path, checkpoint_every=1e-9),
+        reconstruct(burst, **METHODS["network"]),
+    )
+    assert Checkpoint.load(path).step == tries[0]
+    assert f"the run goes on, but could not be kept: {path} cannot be written" in caplog.text
 
 
 def test_a_rate_that_was_changed_meanwhile_stays(burst, kept):

@@ -1,6 +1,7 @@
 """Checkpoints: where a fit of networks stands, in a file from which it goes on after it was killed."""
 
 import hashlib
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from napari_fiberburst.io.results import SOFTWARE
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.settings import Settings, SplineMethod
 from napari_fiberburst.stored import Arrays, Stored
+
+logger = logging.getLogger(__name__)
 
 ENDING = ".checkpoint"
 SECONDS_BETWEEN = 60.0
@@ -154,9 +157,12 @@ class Checkpointing:
         return seconds - self._kept_at >= self._every
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Write a checkpoint in place of the one before."""
-        checkpoint.save(self._path)
+        """Write a checkpoint in place of the one before; where that cannot be, as on a full disk, the run goes on."""
         self._kept_at = checkpoint.seconds
+        try:
+            checkpoint.save(self._path)
+        except OutputError as error:
+            logger.warning("the run goes on, but could not be kept: %s", error)
 
 
 def check_kept(settings: Settings) -> None:

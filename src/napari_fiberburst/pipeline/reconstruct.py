@@ -93,7 +93,7 @@ def reconstruct(
         among them, take the preset's place, but for its time budget and previews. In one process the run goes on
         exactly as if it had not been divided; one that was loaded from a file goes on with fresh samples, but
         Adam's moments start anew.
-    checkpoint : str, Path or Checkpointing, optional
+    checkpoint : str or Path, optional
         A file ending in ``.checkpoint``, in which a fit of networks is kept while it runs. Where the file is there, the
         run goes on from it, to the same bits on the same CPU: give a killed run once more. Remove it when the
         result is saved.
