@@ -42,7 +42,7 @@ bench-quick: .venv/bench
 # What a change of the code may cost: a step, memory, startup, and whole fits beside an earlier version's.
 bench-code: .venv/bench
 	$(BIN)/python benchmarks/step.py
-	$(BIN)/python benchmarks/memory.py
+	$(BIN)/python -m benchmarks.memory
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python -m benchmarks.speed
 

@@ -1,7 +1,7 @@
 """How much memory runs take beside their bursts, and how much was estimated: a process each.
 
-    python benchmarks/memory.py
-    python benchmarks/memory.py --methods paper
+    python -m benchmarks.memory
+    python -m benchmarks.memory --methods paper
 
 Prints the peak beside the burst and what was there before, the estimate with the bundle known, as a run has it from its
 first seconds on, and their ratio; then the largest that was off. The exit status is 1 where an estimate is off by more
@@ -10,7 +10,6 @@ than a quarter.
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from benchmarks.fit_once import most_memory
 from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.bundle.samples import lit_pixels
 from napari_fiberburst.memory import estimate_memory
@@ -57,7 +57,7 @@ def fit(path: Path, method: str) -> None:
     burst = Burst(np.load(path)["frames"])
     before = psutil.Process().memory_info().rss
     result = reconstruct(burst, **METHODS[method])
-    peak = _peak()
+    peak = most_memory()
     settings = choose(**METHODS[method])
     known: dict[str, Any] = {}
     if result.bundle is not None:
@@ -70,15 +70,6 @@ def fit(path: Path, method: str) -> None:
 
         parts = MemoryLimit(burst.shape, settings).parts(**known)
     print(json.dumps([peak - before, estimate_memory(burst.shape, settings, **known, parts=parts)]))
-
-
-def _peak() -> int:
-    """Return the most memory that this process has taken, bytes."""
-    status = Path("/proc/self/status")
-    if status.exists():  # what `getrusage` tells under Linux is the parent's peak, where that was higher
-        (told,) = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
-        return int(told.split()[1]) * 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 2**10)
 
 
 def main() -> int:
@@ -99,7 +90,7 @@ def main() -> int:
             for method in options.methods:
                 if method not in _OF_ALL and name not in _SMALL:
                     continue
-                command = [sys.executable, __file__, "--fit", str(path), method]
+                command = [sys.executable, "-m", "benchmarks.memory", "--fit", str(path), method]
                 printed = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout
                 taken, told = json.loads(printed.splitlines()[-1])
                 worst = max(worst, told / taken, taken / told, key=abs)
