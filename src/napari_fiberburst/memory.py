@@ -3,20 +3,20 @@
 from typing import Literal
 
 from napari_fiberburst.errors import MemoryLimitError
-from napari_fiberburst.settings import NetworkMethod, PublishedMethod, Settings, SplineMethod
+from napari_fiberburst.settings import NetworkMethod, PublishedMethod, Settings, Siren, SplineMethod
 from napari_fiberburst.settings.settings import bytes_of
 
 Kind = Literal["cores", "pixels"]
-# Fitted to what `benchmarks/memory.py` measures.
+# Fitted to what `python -m benchmarks.memory` measures.
 _FIXED = 107e6
 _PER_VALUE, _PER_PIXEL, _PER_FURTHER_NODE = 18, 112, 300
 # Of a sample, and of each of its channels.
-_PER_SAMPLE = {"cores": (90, 67), "pixels": (47, 21)}
-# Of training: whatever the batch; and of a sample, as recorded or behind a bundle.
-_FIXED_OF_TRAINING, _PER_RECORDED, _PER_TAKEN = 190e6, 9, 71
-# Of a unit of the scene network for each point: of the first so many, and of further ones. glibc takes arrays below
-# 32 MiB from its heap, and does not fill all the holes there.
-_FIRST_UNITS, _PER_FIRST_UNIT, _PER_UNIT = 30e6, 14, 6.9
+_PER_SAMPLE = {"cores": (90, 67), "pixels": (40, 27)}
+# Of training: whatever the batch; of a sample as recorded; and of one behind a bundle, and of each of its channels.
+_FIXED_OF_TRAINING, _PER_RECORDED, _PER_TAKEN = 190e6, 9, (50, 21)
+# Of a unit of the scene network for each point. glibc takes arrays below this size from its heap, and does not fill all
+# the holes there. A sine keeps its argument, too.
+_HEAP_BELOW, _PER_UNIT_IN_HEAP, _PER_UNIT, _OF_SINE = 2**25, 14, 9.0, 1.15
 # Behind a bundle, a core is seen by so many points of its footprint.
 _POINTS = {"cores": 7, "pixels": 1}
 # Samples to a pixel before the bundle is known: cores that lie close together, or what is lit of them.
@@ -76,15 +76,17 @@ def estimate_memory(
     )
     if isinstance(method, SplineMethod):
         return int(aligning)
-    training = _PER_TAKEN * frames * each + _of_training(method, height * width, _POINTS[kind], parts)
+    taken = (_PER_TAKEN[0] + _PER_TAKEN[1] * channels) * frames * each
+    training = taken + _of_training(method, height * width, _POINTS[kind], parts)
     return int(max(aligning, training))
 
 
 def _of_training(method: NetworkMethod | PublishedMethod, frame: int, points: int, parts: int) -> float:
     batch = method.batch or -(-frame // _PUBLISHED_BATCHES)
-    units = -(-batch // parts) * points * method.scene_layers * method.scene_width
-    first = min(units, _FIRST_UNITS)
-    return _FIXED_OF_TRAINING + _PER_FIRST_UNIT * first + _PER_UNIT * (units - first)
+    seen = -(-batch // parts) * points
+    each = _PER_UNIT_IN_HEAP if 4 * seen * method.scene_width < _HEAP_BELOW else _PER_UNIT
+    sine = _OF_SINE if isinstance(method.encoding, Siren) else 1.0
+    return _FIXED_OF_TRAINING + each * sine * seen * method.scene_layers * method.scene_width
 
 
 class MemoryLimit:
