@@ -64,7 +64,8 @@ def test_every_choice_shows_every_parameter_it_has(form, motion, encoding):
         assert "needs a network encoding" in form.problem or "needs encoding 'spline'" in form.problem
         assert form.problem in [label.text() for label in form.findChildren(QLabel) if not label.isHidden()]
     else:
-        wanted = set(choose(motion=motion, encoding=encoding).parameters) - {"preview_every", "device", "leave_out", "memory"}
+        not_shown = {"preview_every", "device", "leave_out", "memory"}
+        wanted = set(choose(motion=motion, encoding=encoding).parameters) - not_shown
         assert form.shown == wanted
 
 
