@@ -86,7 +86,9 @@ def targets(folder: Path) -> dict[str, Target]:
     reconstruct(
         burst, encoding="fourier", features=4, scene_width=8, iterations=3, checkpoint=kept_run, checkpoint_every=1e-9
     )
-    reads("checkpoint", kept_run, lambda: Checkpoint.load(kept_run), lambda run: None if run.step > 0 else "no steps")
+    reads(
+        "checkpoint", kept_run, lambda: Checkpoint.load(kept_run), lambda run: None if run.now.step > 0 else "no steps"
+    )
     settings = folder / "batch.toml"
     settings.write_text("[recording]\nframe_rate = 20\n[video]\nwindow = 9\nstabilised = true\n")
     reads("settings", settings, lambda: read_settings(settings, "video"), lambda value: None)

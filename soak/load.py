@@ -11,7 +11,7 @@ import joblib
 import psutil
 from distributed import Client, LocalCluster
 
-from napari_fiberburst import reconstruct
+from napari_fiberburst import Burst, reconstruct
 from napari_fiberburst.simulation import simulate
 from soak.trials import Count
 
@@ -57,16 +57,18 @@ def at_once(count: Count, rounds: int) -> None:
         count.lose(f"threads are left: {left}")
 
 
+def _burst(seed: int) -> Burst:
+    return simulate("histology", shape=(27, 31), frames=3, pitch=4.0, channels=1, seed=seed).burst
+
+
 def _published(seed: int) -> None:
     """Do a few steps of the published method."""
-    burst = simulate("histology", shape=(27, 31), frames=3, pitch=4.0, channels=1, seed=seed).burst
-    reconstruct(burst, preset="paper", iterations=3, device="cpu")
+    reconstruct(_burst(seed), preset="paper", iterations=3, device="cpu")
 
 
 def digest_of(seed: int) -> str:
     """Return what tells the bits of one small reconstruction from others."""
-    burst = simulate("histology", shape=(27, 31), frames=3, pitch=4.0, channels=1, seed=seed).burst
-    return hashlib.sha256(reconstruct(burst, device="cpu").image.tobytes()).hexdigest()
+    return hashlib.sha256(reconstruct(_burst(seed), device="cpu").image.tobytes()).hexdigest()
 
 
 def _compare(count: Count, name: str, run: Callable[[], list[str]], alone: list[str]) -> None:

@@ -80,7 +80,7 @@ def test_what_fits_in_no_number_of_parts_is_refused_and_told(burst, choices):
         reconstruct(burst, **choices, memory="50 MB")
 
 
-def test_one_value_a_core_is_taken_where_pixels_do_not_fit(monkeypatch):
+def test_one_value_a_core_is_taken_where_pixels_do_not_fit():
     burst = simulate("histology", shape=(127, 141), frames=8, pitch=6.0, channels=1, seed=3).burst
     assert reconstruct(burst).settings.flat()["observation"] == "pixels"
     cores = estimate_memory(burst.shape, choose(), kind="cores", samples=500)

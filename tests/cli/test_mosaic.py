@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 
 from napari_fiberburst.cli import main
-from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.recordings import mosaic as mosaics
 from napari_fiberburst.recordings.work import is_begun
-from napari_fiberburst.simulation import simulate_recording
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory):
-    path = tmp_path_factory.mktemp("recording") / "clip.mkv"
-    write_video(simulate_recording(path="raster", shape=(71, 89), frames=12, seed=1).source, path)
-    return path
 
 
 @pytest.fixture
@@ -58,14 +49,8 @@ def test_a_run_that_is_stopped_goes_on(words, tmp_path, capsys, monkeypatch, num
     assert main(words) == 0
 
 
-def test_work_is_begun_anew_where_that_is_asked_for(words, tmp_path, monkeypatch):
-    def stop(*given):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(mosaics, "draw_unit", stop)
-        with pytest.raises(SystemExit):
-            main(words)
+def test_work_is_begun_anew_where_that_is_asked_for(words, tmp_path, stop_drawing):
+    stop_drawing(words)
     assert (tmp_path / "m.ome.zarr").exists()
     assert main([*words[:-1], "similarity", "--fresh"]) == 0
     poses = np.genfromtxt(tmp_path / "m.poses.csv", delimiter=",", names=True)

@@ -1,5 +1,6 @@
 """``fiberburst resume``: a run goes on by the command that it was begun with, from any folder."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,24 +12,16 @@ import tifffile
 
 from napari_fiberburst import open_recording, reconstruct
 from napari_fiberburst.cli import main
-from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.recordings import mosaic as mosaics
 from napari_fiberburst.recordings.mosaic import mosaic
 from napari_fiberburst.recordings.work import is_begun
-from napari_fiberburst.simulation import simulate, simulate_recording
+from napari_fiberburst.simulation import simulate
 
 
 @pytest.fixture
 def burst(tmp_path):
     path = tmp_path / "b.tif"
     tifffile.imwrite(path, simulate("histology", shape=(45, 52), frames=6, pitch=4.0, channels=1).burst.frames[..., 0])
-    return path
-
-
-@pytest.fixture
-def clip(tmp_path):
-    path = tmp_path / "clip.mkv"
-    write_video(simulate_recording(path="raster", shape=(71, 89), frames=12, seed=1).source, path)
     return path
 
 
@@ -52,20 +45,11 @@ def test_a_fit_that_was_killed_goes_on_to_the_same_bits(burst, tmp_path, monkeyp
     np.testing.assert_array_equal(tifffile.imread(tmp_path / "a.ome.tif"), whole.image)
 
 
-def stopped(words, monkeypatch):
-    def stop(*given):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(mosaics, "draw_unit", stop)
-        with pytest.raises(SystemExit):
-            main(words)
-
-
 @pytest.mark.parametrize("named", ["m.ome.zarr", "m.work"])
-def test_a_mosaic_goes_on_though_its_command_would_begin_anew(clip, tmp_path, monkeypatch, capsys, named):
+def test_a_mosaic_goes_on_though_its_command_would_begin_anew(clip, tmp_path, monkeypatch, stop_drawing, capsys, named):
     monkeypatch.chdir(tmp_path)
-    stopped(["mosaic", clip.name, "-o", "m.ome.zarr", "--motion", "translation", "--fresh"], monkeypatch)
+    recording = os.path.relpath(clip, tmp_path)
+    stop_drawing(["mosaic", recording, "-o", "m.ome.zarr", "--motion", "translation", "--fresh"])
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
 
@@ -74,7 +58,7 @@ def test_a_mosaic_goes_on_though_its_command_would_begin_anew(clip, tmp_path, mo
 
     monkeypatch.setattr("napari_fiberburst.recordings.traces.trace_part", traced_again)
     assert main(["resume", str(tmp_path / named)]) == 0
-    assert "fiberburst mosaic clip.mkv -o m.ome.zarr" in capsys.readouterr().out
+    assert f"fiberburst mosaic {recording} -o m.ome.zarr" in capsys.readouterr().out
     assert not is_begun(tmp_path / "m.work")
 
 
@@ -97,8 +81,8 @@ def test_what_a_script_has_begun_is_told(clip, tmp_path, monkeypatch, capsys):
         ('{"words": ["mosaic"], "folder": "/not/here"}', "which is not there"),
     ],
 )
-def test_a_command_that_was_altered_is_not_run(clip, tmp_path, monkeypatch, capsys, told, why):
-    stopped(["mosaic", str(clip), "-o", str(tmp_path / "m.ome.zarr")], monkeypatch)
+def test_a_command_that_was_altered_is_not_run(clip, tmp_path, stop_drawing, capsys, told, why):
+    stop_drawing(["mosaic", str(clip), "-o", str(tmp_path / "m.ome.zarr")])
     (tmp_path / "m.work" / "command.json").write_text(told)
     assert main(["resume", str(tmp_path / "m.ome.zarr")]) == 2
     assert why in capsys.readouterr().err

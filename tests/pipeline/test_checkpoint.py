@@ -31,7 +31,7 @@ def once_kept(path, step, end):
     """Return a report of progress that ends a run once its checkpoint tells of so many steps."""
 
     def report(progress):
-        if path.exists() and Checkpoint.load(path).step >= step:
+        if path.exists() and Checkpoint.load(path).now.step >= step:
             end()
 
     return report
@@ -76,7 +76,7 @@ def test_a_stopped_run_is_kept_where_it_stopped(burst, tmp_path, same):
         burst, **choices, checkpoint_every=1e-9, on_progress=once_kept(path, 9, control.stop), control=control
     )
     assert stopped.ending == "stopped"
-    assert Checkpoint.load(path).step == len(stopped.losses)
+    assert Checkpoint.load(path).now.step == len(stopped.losses)
     same(reconstruct(burst, **choices), reconstruct(burst, **METHODS["network"]))
 
 
@@ -84,7 +84,7 @@ def test_a_disk_that_is_full_does_not_end_the_run(burst, tmp_path, monkeypatch, 
     path, save, tries = tmp_path / "run.checkpoint", Checkpoint.save, []
 
     def full(checkpoint, path):
-        tries.append(checkpoint.step)
+        tries.append(checkpoint.now.step)
         if len(tries) > 1:
             raise OutputError(f"{path} cannot be written (No space left on device); choose another place")
         return save(checkpoint, path)
@@ -94,17 +94,18 @@ def test_a_disk_that_is_full_does_not_end_the_run(burst, tmp_path, monkeypatch, 
         reconstruct(burst, **METHODS["network"], checkpoint=path, checkpoint_every=1e-9),
         reconstruct(burst, **METHODS["network"]),
     )
-    assert Checkpoint.load(path).step == tries[0]
+    assert Checkpoint.load(path).now.step == tries[0]
     assert f"the run goes on, but could not be kept: {path} cannot be written" in caplog.text
 
 
 def test_a_rate_that_was_changed_meanwhile_stays(burst, kept):
     found = Checkpoint.load(kept)
-    method = {**found.method["method"], "learning_rate": 1e-5}
-    replace(found, method={**found.method, "method": method}).save(kept)
+    settings = found.now.method
+    method = {**settings["method"], "learning_rate": 1e-5}
+    replace(found, now=replace(found.now, method={**settings, "method": method})).save(kept)
     gone_on = reconstruct(burst, **METHODS["network"], checkpoint=kept)
     assert gone_on.settings.method.learning_rate == 1e-5
-    np.testing.assert_allclose(gone_on.losses[found.step :].std(), 0, atol=gone_on.losses[: found.step].std())
+    np.testing.assert_allclose(gone_on.losses[found.now.step :].std(), 0, atol=gone_on.losses[: found.now.step].std())
 
 
 @pytest.mark.parametrize(
@@ -131,26 +132,36 @@ def test_time_budget_and_device_may_be_others(burst, kept):
     )
 
 
-@pytest.mark.parametrize("part", ["state", "best_state"])
+@pytest.mark.parametrize("part", ["now", "best"])
 def test_arrays_of_other_networks_are_refused(burst, kept, part):
     found = Checkpoint.load(kept)
-    arrays = getattr(found, part)
+    state = getattr(found, part)
+    arrays = state.arrays
     name = sorted(arrays)[0]
     for changed in (
         {**arrays, name: np.zeros((3, 3), np.float32)},
         {key: arrays[key] for key in arrays if key != name},
     ):
-        replace(found, **{part: changed}).save(kept)
+        replace(found, **{part: replace(state, arrays=changed)}).save(kept)
         with pytest.raises(FiberBurstError, match="does not belong to this run"):
             reconstruct(burst, **METHODS["network"], checkpoint=kept)
 
 
 @pytest.mark.parametrize(
     "change",
-    [{"step": -1}, {"losses": np.zeros(2, np.float32)}, {"seconds": np.inf}, {"best_error": None}, {"command": 3}],
+    [
+        lambda found: {"now": replace(found.now, step=-1)},
+        lambda found: {"best": replace(found.best, drawn=-1)},
+        lambda found: {"losses": np.zeros(2, np.float32)},
+        lambda found: {"seconds": np.inf},
+        lambda found: {"best_error": None},
+        lambda found: {"run": 3},
+        lambda found: {"command": 3},
+    ],
 )
 def test_values_that_do_not_belong_together_are_refused(kept, change):
-    replace(Checkpoint.load(kept), **change).save(kept)
+    found = Checkpoint.load(kept)
+    replace(found, **change(found)).save(kept)
     with pytest.raises(FiberBurstError, match="holds no complete checkpoint"):
         Checkpoint.load(kept)
 

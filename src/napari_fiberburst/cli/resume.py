@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from napari_fiberburst.errors import OutputError
+from napari_fiberburst.io.results import CHECKPOINT_ENDING
 
-_CHECKPOINT = ".checkpoint"
 # Commands that go on where they were, and the options by which they would begin anew.
 _COMMANDS = ("reconstruct", "mosaic", "video", "batch")
 _ANEW = {"fresh": False, "resume": True}
@@ -33,7 +33,7 @@ def add_to(commands: Any, parse: Callable[[Sequence[str]], argparse.Namespace]) 
 def run(options: argparse.Namespace, parse: Callable[[Sequence[str]], argparse.Namespace]) -> int:
     """Give the command again, in the folder that it was given in."""
     path = options.path.resolve()
-    words, folder = _of_checkpoint(path) if path.name.lower().endswith(_CHECKPOINT) else _of_work(path)
+    words, folder = _of_checkpoint(path) if path.name.lower().endswith(CHECKPOINT_ENDING) else _of_work(path)
     if not words:
         raise OutputError(f"{options.path} was begun by a script: run that again, and it goes on from there")
     if words[0] not in _COMMANDS:

@@ -26,6 +26,7 @@ from napari_fiberburst.io.plain import parse_json, plain_scalar, read_json
 IMAGE_ENDINGS = (".ome.tif", ".ome.tiff", ".tif", ".tiff")
 # All that a result has; no other program has files of this name.
 MODEL_ENDING = ".fiberburst"
+CHECKPOINT_ENDING = ".checkpoint"
 _PARTIAL = ".part"
 REPRESENTATION_ENDING = ".npz"
 PICTURE_ENDING = ".png"

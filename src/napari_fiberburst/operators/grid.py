@@ -47,9 +47,14 @@ class Grid:
         return cls(x0, y0, spacing, (rows, columns))
 
     @classmethod
-    def around(cls, points: Tensor, spacing: float, margin: float) -> "Grid":
-        """Cover all finite points (..., 2) and a margin about them, pixels."""
-        corners = [corner for part in points.reshape(-1, *points.shape[-2:]) for corner in _corners_of(part)]
+    def around(cls, points: Tensor, spacing: float, margin: float, among: Tensor | None = None) -> "Grid":
+        """Cover all finite points (..., 2), or those of them that `among` (...) tells, and a margin about them, pixels.
+
+        Part by part, because a copy of all points would take much memory.
+        """
+        parts = points.reshape(-1, *points.shape[-2:])
+        chosen = [slice(None)] * len(parts) if among is None else among.reshape(-1, points.shape[-2])
+        corners = [corner for part, some in zip(parts, chosen, strict=True) for corner in _corners_of(part[some])]
         x0, y0 = (torch.stack(corners).amin(dim=0) - margin).tolist()
         x1, y1 = (torch.stack(corners).amax(dim=0) + margin).tolist()
         return cls.over((x0, y0, x1, y1), spacing)

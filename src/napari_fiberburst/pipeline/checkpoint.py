@@ -14,17 +14,38 @@ from numpy.typing import NDArray
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import OutputError, SettingsError
-from napari_fiberburst.io.results import SOFTWARE
+from napari_fiberburst.io.results import CHECKPOINT_ENDING, SOFTWARE
 from napari_fiberburst.results.reconstruction import Reconstruction
 from napari_fiberburst.settings import Settings, SplineMethod
 from napari_fiberburst.stored import Arrays, Stored
 
 logger = logging.getLogger(__name__)
 
-ENDING = ".checkpoint"
 SECONDS_BETWEEN = 60.0
 # Settings that a run may go on with others of.
 _MAY_DIFFER = ("device", "time_budget", "preview_every", "memory")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KeptState:
+    """A fit of networks after some steps.
+
+    Attributes
+    ----------
+    step : int
+        Steps done.
+    method : dict
+        `napari_fiberburst.settings.Settings` with the method as it was then, as plain values.
+    arrays : dict
+        Of the networks and of Adam, by name.
+    drawn : int
+        Samples drawn.
+    """
+
+    step: int
+    method: dict[str, Any]
+    arrays: Arrays
+    drawn: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,24 +56,16 @@ class Checkpoint(Stored):
     ----------
     run : dict
         What the run is told by, by name: `told_by`.
-    method : dict
-        `napari_fiberburst.settings.Settings` with the method as it is by now, as plain values.
-    step : int
-        Steps done.
+    now : KeptState
+        The newest state.
     seconds : float
-        That they took.
+        That it took.
     losses : numpy.ndarray
-        (step,) float32.
-    state : dict
-        Arrays of the networks and of Adam, by name.
-    drawn : int
-        Samples drawn.
-    best_step : int or None
-        Steps done when the error of held-out samples was the least; None where there are none.
+        (steps,) float32.
+    best : KeptState or None
+        The state with the least error of held-out samples; None where there are none.
     best_error : float or None
         That error, full scale 1.
-    best_method, best_state, best_drawn
-        As they were then.
     command : list of str
         Words of the command that has begun the run, for `fiberburst resume`; empty where a script has begun it.
     folder : str
@@ -60,36 +73,31 @@ class Checkpoint(Stored):
     """
 
     _kind: ClassVar[str] = "checkpoint"
-    _ending: ClassVar[str] = ENDING
+    _ending: ClassVar[str] = CHECKPOINT_ENDING
 
     run: dict[str, Any]
-    method: dict[str, Any]
-    step: int
+    now: KeptState
     seconds: float
     losses: NDArray[np.float32]
-    state: Arrays
-    drawn: int
-    best_step: int | None
+    best: KeptState | None
     best_error: float | None
-    best_method: dict[str, Any]
-    best_state: Arrays
-    best_drawn: int
     command: list[str]
     folder: str
 
     def _check(self) -> None:
-        numbers = (self.step, self.drawn, self.best_drawn, 0 if self.best_step is None else self.best_step)
-        if not all(isinstance(number, int) and number >= 0 for number in numbers):
-            raise ValueError(f"steps and samples are counted from 0; got {numbers}")
-        if self.losses.shape != (self.step,) or not np.isfinite(self.losses).all():
-            raise ValueError(f"a run of {self.step} steps has as many losses; got {self.losses.shape}")
+        for state in filter(None, (self.now, self.best)):
+            if not all(isinstance(number, int) and number >= 0 for number in (state.step, state.drawn)):
+                raise ValueError(f"steps and samples are counted from 0; got {state.step} and {state.drawn}")
+            if not isinstance(state.method, dict):
+                raise ValueError(f"a method must be values by name; got {type(state.method).__name__}")
+        if self.losses.shape != (self.now.step,) or not np.isfinite(self.losses).all():
+            raise ValueError(f"a run of {self.now.step} steps has as many losses; got {self.losses.shape}")
         if not (isinstance(self.seconds, float) and 0 <= self.seconds < math.inf):
             raise ValueError(f"a run takes a finite time; got {self.seconds}")
-        if (self.best_step is None) != (self.best_error is None):
-            raise ValueError("the best step and its error go together")
-        for name, part in (("run", self.run), ("method", self.method), ("best_method", self.best_method)):
-            if not isinstance(part, dict):
-                raise ValueError(f"{name} must be values by name; got {type(part).__name__}")
+        if (self.best is None) != (self.best_error is None):
+            raise ValueError("the best state and its error go together")
+        if not isinstance(self.run, dict):
+            raise ValueError(f"run must be values by name; got {type(self.run).__name__}")
         if not (isinstance(self.command, list) and all(isinstance(word, str) for word in self.command)):
             raise ValueError("the command must be words")
         if not isinstance(self.folder, str):

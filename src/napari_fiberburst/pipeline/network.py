@@ -19,7 +19,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.memory import MemoryLimit
 from napari_fiberburst.networks.image import Representation
 from napari_fiberburst.networks.training import BehindBundle, Problem, State
-from napari_fiberburst.pipeline.checkpoint import Checkpoint, Checkpointing
+from napari_fiberburst.pipeline.checkpoint import Checkpoint, Checkpointing, KeptState
 from napari_fiberburst.pipeline.diagnose import diagnose
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.spline import SplineFit
@@ -212,7 +212,7 @@ class Training:
         """Take steps until there are enough."""
         self._clock = clock
         if self._keeper is not None and self._keeper.found is not None:
-            clock.leave_out(-self._keeper.found.seconds)
+            clock.leave_out(-self._keeper.found.seconds)  # time goes on from where it was
         while self._step < self._iterations:
             self._follow()
             # The loss stays on the device until someone looks.
@@ -353,42 +353,42 @@ class Training:
 
     def _checkpoint(self, keeper: Checkpointing, seconds: float) -> Checkpoint:
         """Return where the fit stands."""
-        state = self._problem.state()
-        error, best = (None, _Kept(0, self._method, state)) if self._best is None else self._best
+        error, best = (None, None) if self._best is None else self._best
         return Checkpoint(
             run=keeper.run,
-            method=self._settings.to_dict(),
-            step=self._step,
+            now=self._stored(_Kept(self._step, self._method, self._problem.state())),
             seconds=seconds,
             losses=np.array(self._losses, dtype=np.float32),
-            state=self._problem.stored(state),
-            drawn=state[-1],
-            best_step=None if error is None else best.step,
+            best=None if best is None else self._stored(best),
             best_error=error,
-            best_method=replace(self._settings, method=best.method).to_dict(),
-            best_state={} if error is None else self._problem.stored(best.state),
-            best_drawn=best.state[-1],
             command=keeper.command,
             folder=keeper.folder,
         )
 
-    def _go_on_from(self, kept: Checkpoint) -> None:
+    def _stored(self, kept: _Kept) -> KeptState:
+        settings = replace(self._settings, method=kept.method)
+        arrays = self._problem.stored(kept.state)
+        return KeptState(step=kept.step, method=settings.to_dict(), arrays=arrays, drawn=kept.state[-1])
+
+    def _kept_from(self, stored: KeptState) -> _Kept:
+        state = self._problem.state_from(stored.arrays, stored.drawn)
+        return _Kept(stored.step, _method_of(stored.method), state)
+
+    def _go_on_from(self, found: Checkpoint) -> None:
         """Return to where an earlier process has come to."""
         try:
-            state = self._problem.state_from(kept.state, kept.drawn)
-            self._method = _method_of(kept.method)
-            self._problem.restore(state)
-            if kept.best_step is not None and kept.best_error is not None:
-                best = self._problem.state_from(kept.best_state, kept.best_drawn)
-                self._best = (kept.best_error, _Kept(kept.best_step, _method_of(kept.best_method), best))
+            kept = self._kept_from(found.now)
+            self._problem.restore(kept.state)
+            if found.best is not None and found.best_error is not None:
+                self._best = found.best_error, self._kept_from(found.best)
         except (ValueError, TypeError, LookupError, RuntimeError) as error:
             raise OutputError(
                 f"the checkpoint does not belong to this run ({error}); remove it, and begin anew"
             ) from error
+        self._step, self._method, self._kept = kept.step, kept.method, (kept,)
         if self._method.learning_rate is not None:
             self._problem.set_learning_rate(self._method.learning_rate)
-        self._losses, self._step = kept.losses.tolist(), kept.step
-        self._kept = (_Kept(self._step, self._method, state),)
+        self._losses = found.losses.tolist()
 
     def _snapshot(self) -> Snapshot:
         return Snapshot(

@@ -89,7 +89,7 @@ class KeptRun:
     def beside(self, ending: str) -> str:
         """Return a place for what is written of it, called by its name: where its burst lies, if that is a file."""
         name = f"{self.name} {ending}"
-        return name if self.source.path is None else str(Path(self.source.path).absolute().with_name(name))
+        return name if self.source.path is None else str(Path(self.source.path).absolute().parent / name)
 
     @property
     def row(self) -> tuple[str | float, ...]:

@@ -104,9 +104,7 @@ def _smooth_over_frames(spacing: float, points: Tensor, values: Tensor, weights:
 
     Frame by frame, because where samples lie on a grid takes many times the memory of their values.
     """
-    counted = weights > 0
-    corners = torch.cat([_corners(points[number][used]) for number, used in enumerate(counted) if bool(used.any())])
-    grid = Grid.around(corners, spacing, 2 * spacing)
+    grid = Grid.around(points, spacing, 2 * spacing, weights > 0)
     total, mass = torch.zeros(2, *grid.shape).to(values)
     for number, weight in enumerate(weights):
         at = grid.at(points[number])
@@ -116,8 +114,3 @@ def _smooth_over_frames(spacing: float, points: Tensor, values: Tensor, weights:
     smooth = torch.stack([total / mass.clamp_min(1e-9), mass])
     mean, looked = torch.stack([grid.at(part).of_channels(smooth) for part in points]).unbind(dim=-1)
     return mean, looked
-
-
-def _corners(points: Tensor) -> Tensor:
-    """Return the two corners (2, 2) of the box about finite points (N, 2)."""
-    return torch.stack([points.amin(dim=0), points.amax(dim=0)])
