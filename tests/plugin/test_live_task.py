@@ -60,6 +60,8 @@ def test_a_replay_is_shown_frozen_and_kept_as_the_burst_it_was(live, qtbot, tmp_
     task.source.rate.setValue(8)
     task.start_button.click()
     wait_for(qtbot, lambda: "live" in viewer.layers and task.state == "live")
+    # The first frame has a picture before the second one has come.
+    wait_for(qtbot, lambda: len(task.job.last(10).frames) > 2)
     task.pause_button.click()
     assert task.state == "frozen"
     shown = viewer.layers["live"].data.copy()
