@@ -5,6 +5,7 @@ import signal
 import numpy as np
 import pytest
 
+from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.cli import main
 from napari_fiberburst.recordings import mosaic as mosaics
 from napari_fiberburst.recordings.work import is_begun
@@ -26,6 +27,25 @@ def test_an_output_is_replaced_only_where_that_is_asked_for(words, tmp_path, cap
     assert main([*words, "--overwrite"]) == 0
     assert not (tmp_path / "m.ome.zarr" / "old").exists()
     assert not is_begun(tmp_path / "m.work")
+
+
+def test_a_recording_keeps_its_bundle_and_improves_one(words, tmp_path, capsys):
+    first, second = tmp_path / "first.bundle", tmp_path / "second.bundle"
+    assert main([*words, "--keep-bundle", str(first)]) == 0
+    assert f"wrote {first}" in capsys.readouterr().out
+    found = Bundle.load(first)
+    assert found.gains_known
+    assert main([*words, "--overwrite", "--bundle", str(first), "--keep-bundle", str(second)]) == 0
+    better = Bundle.load(second)
+    assert better.provenance["bursts"] == found.provenance.get("bursts", 0) + 1
+    assert (better.gain_weights >= found.gain_weights).all()
+    assert (better.gain_weights > found.gain_weights).mean() > 0.9
+
+
+def test_a_bundle_that_cannot_be_kept_is_told_before_anything_is_done(words, tmp_path, capsys):
+    assert main([*words, "--keep-bundle", str(tmp_path / "probe.npz")]) == 2
+    assert "ending in .bundle" in capsys.readouterr().err
+    assert not (tmp_path / "m.work").exists()
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

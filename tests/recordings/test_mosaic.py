@@ -51,6 +51,33 @@ def fidelity(made, recording, piece):
     return psnr(picture[known][None], truth[None])
 
 
+def gain_error(bundle, recording):
+    """Return the spread of cores' brightness about the true one, relative, common factor aside."""
+    true = replace(bundle, transmission=recording.transmission.astype(np.float32)).brightness
+    inner = ((bundle.centres > 6) & (bundle.centres < np.array(bundle.shape[::-1]) - 7)).all(axis=1)
+    ratio = (bundle.brightness / np.maximum(true, 1e-9))[inner & (true > 0.1)]
+    return ratio.std() / ratio.mean()
+
+
+def test_the_bundle_is_better_known_by_all_frames(made, hand, located):
+    assert made.bundle.gains_known
+    assert gain_error(made.bundle, hand) < 0.5 * gain_error(located.work.bundle, hand)
+
+
+def test_a_bundle_that_was_known_is_made_better(made, hand, rng):
+    """Its gains are 10 % off, and rest on little light."""
+    wrong = np.append(1 + 0.1 * rng.standard_normal(len(made.bundle.centres)), 1).astype(np.float32)
+    known = replace(
+        made.bundle,
+        transmission=made.bundle.transmission * wrong[made.bundle.labels],
+        gain_weights=np.full(len(made.bundle.centres), 0.5, np.float32),
+    )
+    assert gain_error(known, hand) > 0.08
+    better = known.updated(made)
+    assert gain_error(better, hand) < 0.03
+    assert (better.gain_weights >= known.gain_weights).all()
+
+
 def test_frames_lie_where_they_were(made, hand):
     pieces, matrices = placed(made)
     for piece in range(len(made.paths)):

@@ -44,6 +44,7 @@ def track_of(places, dof):
         error=0.01,
         shape=SHAPE,
         dof=dof,
+        gain_weights=np.zeros(5, np.float32),
     )
 
 

@@ -30,6 +30,7 @@ def track():
         error=0.01,
         shape=SHAPE,
         dof=6,
+        gain_weights=np.zeros(5, np.float32),
         control=rng.normal(0, 2, (6, 2, rows * columns)).astype(np.float32),
     )
 

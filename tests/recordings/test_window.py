@@ -29,6 +29,7 @@ def track_of(places, piece=None):
         error=0.01,
         shape=SHAPE,
         dof=2,
+        gain_weights=np.zeros(CORES, np.float32),
     )
 
 

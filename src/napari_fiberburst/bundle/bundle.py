@@ -279,9 +279,9 @@ class Bundle(Stored):
 
         Parameters
         ----------
-        measured : Reconstruction
-            Of a burst through this bundle, ``reconstruct(frames, bundle=bundle)``. It may have been cropped, and the
-            bundle may have moved.
+        measured : Reconstruction, Mosaic or Video
+            Of frames through this bundle, such as ``reconstruct(frames, bundle=bundle)``. They may have been cropped,
+            and the bundle may have moved.
 
         Raises
         ------
@@ -422,15 +422,15 @@ class Bundle(Stored):
 
 
 class GainMeasurement(Protocol):
-    """What a reconstruction tells of a bundle; see `napari_fiberburst.results.diagnostics.Diagnostics`."""
+    """What frames tell of a bundle: a `Reconstruction`, or a mosaic or a video of a recording."""
 
     @property
     def bundle(self) -> Bundle | None:
-        """The bundle that the burst was reconstructed with."""
+        """The bundle that the frames were sampled with."""
 
     @property
     def gain_ratios(self) -> NDArray[np.float32] | None:
-        """Each core's gain as the burst shows it, relative to the bundle's, (N,)."""
+        """Each core's gain as the frames show it, relative to the bundle's, (N,)."""
 
     @property
     def gain_weights(self) -> NDArray[np.float32] | None:

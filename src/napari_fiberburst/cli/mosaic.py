@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from napari_fiberburst.cli.keeping import add_keeping, check_keeping, keep
 from napari_fiberburst.cli.work import add_work, clear, worked
 from napari_fiberburst.data.source import FrameSource
 from napari_fiberburst.io import open_recording
@@ -32,6 +33,7 @@ def add_recording(parser: argparse.ArgumentParser, output: str) -> None:
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help=output)
     add_known(parser)
+    add_keeping(parser, "this recording")
     add_work(parser)
 
 
@@ -62,6 +64,7 @@ def run(options: argparse.Namespace) -> int:
     from napari_fiberburst.recordings.mosaic import mosaicking
     from napari_fiberburst.recordings.outputs import check_target
 
+    check_keeping(options)
     clear(options)
     check_target(options.output, "mosaic")
     source, bundle = opened(options)
@@ -76,4 +79,6 @@ def run(options: argparse.Namespace) -> int:
     reasons = f": {'; '.join(found.notes)}" if found.notes else ""
     print(f"the mosaic is {found.quality}{reasons}")
     print(f"wrote {' and '.join(map(str, (*found.paths, found.poses)))}")
+    if options.keep_bundle is not None:
+        keep(options.keep_bundle, found, bundle)
     return 0

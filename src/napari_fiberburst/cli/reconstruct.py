@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from napari_fiberburst.cli.arguments import add_frames, add_settings, parse_crop, settings_of
+from napari_fiberburst.cli.keeping import add_keeping, check_keeping, keep
 from napari_fiberburst.control import Control
 from napari_fiberburst.errors import OutputError, SettingsError
 from napari_fiberburst.io import read_burst
@@ -23,7 +24,6 @@ from napari_fiberburst.settings import PublishedMethod, Settings, choose
 
 if TYPE_CHECKING:
     from napari_fiberburst.bundle.bundle import Bundle
-    from napari_fiberburst.results.reconstruction import Reconstruction
 
 INTERRUPTED = 130
 
@@ -57,9 +57,7 @@ def add_to(commands: Any) -> None:
         help="probe.bundle, or an image of the bundle in even light; with it one frame is a burst",
     )
     parser.add_argument("--calibration", type=Path, help="short for --bundle with an image")
-    parser.add_argument(
-        "--keep-bundle", type=Path, help="write the bundle here, with what this burst has told of it; a .bundle file"
-    )
+    add_keeping(parser, "this burst")
     parser.add_argument(
         "--checkpoint",
         type=Path,
@@ -145,7 +143,10 @@ def run(options: argparse.Namespace) -> int:
         print(f"the image is {result.quality}{'' if result.quality == 'good' else ': ' + '; '.join(result.notes)}")
     print(f"wrote {' and '.join(map(str, places))}")
     if options.keep_bundle is not None:
-        _keep(options.keep_bundle, result, known)
+        if result.ending == "stopped":
+            print(f"fiberburst: the run was stopped; {options.keep_bundle} was not written", file=sys.stderr)
+        else:
+            keep(options.keep_bundle, result, known)
     if options.checkpoint is not None and options.checkpoint.exists():
         if result.ending == "stopped":
             print(f"to go on: fiberburst resume {options.checkpoint}")
@@ -161,27 +162,13 @@ def _check(options: argparse.Namespace, settings: Settings) -> None:
         raise SettingsError("--calibration is short for --bundle with an image; give one of the two")
     if given and isinstance(settings.method, PublishedMethod):
         raise SettingsError("the published method has no model of the bundle; leave the bundle out, or take auto")
-    if options.keep_bundle is not None:
-        from napari_fiberburst.bundle.bundle import Bundle
-
-        Bundle.check_output(options.keep_bundle)
+    check_keeping(options)
 
 
 def _opened(path: Path) -> "Bundle":
     from napari_fiberburst.pipeline.reconstruct import as_bundle
 
     return as_bundle(path)
-
-
-def _keep(path: Path, result: "Reconstruction", known: "Bundle | None") -> None:
-    """Write the bundle that was given, made better; or the one that was found."""
-    found = result.bundle
-    if result.ending == "stopped" or found is None or not found.gains_known or found.pattern == "none":
-        print(f"fiberburst: the run has not measured the bundle; {path} was not written", file=sys.stderr)
-        return
-    bundle = found if known is None else known.updated(result)
-    bundle.save(path)
-    print(f"wrote {path}")
 
 
 @contextmanager

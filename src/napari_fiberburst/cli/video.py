@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from napari_fiberburst.cli.keeping import check_keeping, keep
 from napari_fiberburst.cli.mosaic import add_recording, opened
 from napari_fiberburst.cli.work import clear, worked
 from napari_fiberburst.settings.freedom import FREEDOM
@@ -53,6 +54,7 @@ def run(options: argparse.Namespace) -> int:
     from napari_fiberburst.recordings.regions import read_regions
     from napari_fiberburst.recordings.video import videoing
 
+    check_keeping(options)
     clear(options)
     check_target(options.output, "video")
     regions = None if options.regions is None else read_regions(options.regions)
@@ -76,4 +78,6 @@ def run(options: argparse.Namespace) -> int:
     print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, each from {found.window}")
     for note in found.notes:
         print(f"note: {note}")
+    if options.keep_bundle is not None:
+        keep(options.keep_bundle, found, bundle)
     return 0

@@ -211,6 +211,7 @@ def _first_track(work: Work, traces: Traces, poses: Poses) -> Track:
         error=float("nan"),
         shape=shape,
         dof=poses.dof,
+        gain_weights=np.zeros(len(work.bundle.centres), np.float32),
     )
     x0, y0, x1, y1 = track.bounds(0) if track.pieces else (0.0, 0.0, 0.0, 0.0)
     if work.bundle.gains_known or (x1 - x0) * (y1 - y0) < _WIDE * shape[0] * shape[1]:

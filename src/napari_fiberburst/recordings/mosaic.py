@@ -4,7 +4,7 @@ import math
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from napari_fiberburst.errors import BurstError
 from napari_fiberburst.io.pyramid import CHUNK, coarsen, create_pyramid, write_tile
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
+from napari_fiberburst.recordings.outcome import Outcome, as_seen
 from napari_fiberburst.recordings.outputs import (
     ENDING,
     OME_UNITS,
@@ -51,31 +52,21 @@ _FURTHER = ("coverage", "uncertainty", "frames")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Mosaic:
-    """What has come of a recording.
+class Mosaic(Outcome):
+    """A wide picture of a recording, and what else has come of it.
 
     Attributes
     ----------
     paths : tuple of Path
         One OME-Zarr image a piece, the largest first.
-    poses : Path
-        The table of all frames' places.
-    track : Track
-        The same.
     resolution : float or None
         Pixels, the finest period on which two halves of the frames agree; None where that is not known.
-    notes : tuple of str
-        What a user should know.
-    quality : str
-        "good", or "doubtful" where the notes say why the picture may be wrong.
+    poses, track, bundle, gain_weights, notes, quality
+        As those of `napari_fiberburst.recordings.outcome.Outcome`.
     """
 
     paths: tuple[Path, ...]
-    poses: Path
-    track: Track
     resolution: float | None
-    notes: tuple[str, ...]
-    quality: Literal["good", "doubtful"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,7 +155,14 @@ def _made(
     finish(folder)
     resolution = None if told.agreement is None else told.agreement.resolution
     return Mosaic(
-        paths=paths, poses=poses, track=track, resolution=resolution, notes=located.notes, quality=located.quality
+        paths=paths,
+        resolution=resolution,
+        poses=poses,
+        track=track,
+        bundle=as_seen(located.work.bundle, track),
+        gain_weights=track.gain_weights,
+        notes=located.notes,
+        quality=located.quality,
     )
 
 

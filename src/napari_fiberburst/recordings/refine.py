@@ -220,6 +220,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
     )
     known = power > _LEAST_LIGHT * power.median()
     ratio = torch.where(known, agreement / power.clamp_min(1e-12), torch.ones_like(power))
+    light = torch.where(known, power, torch.zeros_like(power)).mean(dim=1)
     gains = track.gains * ratio.clamp(1 / _MOST_GAIN, _MOST_GAIN).numpy()
     usual = weighted_median(missed[rarity > 0], rarity[rarity > 0])
     return replace(
@@ -229,6 +230,7 @@ def refined(track: Track, parts: list[Refinement]) -> Track:
         piece=piece,
         exposures=exposures,
         gains=gains / np.median(gains, axis=0),
+        gain_weights=light.numpy(),
         weights=np.nan_to_num((usual / np.maximum(missed, usual)) ** 2).astype(np.float32),
         alike=alike,
         error=usual,

@@ -45,6 +45,8 @@ class Track(Stored):
         Height and width of a frame.
     dof : int
         2 where frames are only shifted, 4 where they turn and grow as well, 6 where they are stretched, too.
+    gain_weights : numpy.ndarray
+        (N,) float32, how much light the gains rest on, full scale 1: 0 for those that the frames have not told.
     control : numpy.ndarray or None
         (T, 2, M) how frames bend beyond that: displacements of control points along x and y, pixels of the scene; None
         where they do not.
@@ -61,6 +63,7 @@ class Track(Stored):
     error: float
     shape: tuple[int, int]
     dof: int
+    gain_weights: NDArray[np.float32]
     control: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:

@@ -4,7 +4,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from napari_fiberburst.io.pyramid import create_pyramid
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.recordings.locate import Located, locating
 from napari_fiberburst.recordings.movie import check_movie, film_source, write_movie
+from napari_fiberburst.recordings.outcome import Outcome, as_seen
 from napari_fiberburst.recordings.outputs import (
     ENDING,
     OME_UNITS,
@@ -40,40 +41,32 @@ _MOST_FIELDS = 4.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Video:
-    """What has come of a recording.
+class Video(Outcome):
+    """Every frame of a recording, and what else has come of it.
+
+    Frames that are not used are shown alone, or not at all.
 
     Attributes
     ----------
     path : Path
         The OME-Zarr video, (T, H, W) or (T, C, H, W), in the recording's own units.
-    poses : Path
-        The table of all frames' places; frames that are not used there are shown alone, or not at all.
     traces : Path
         The Zarr group of traces.
     table : Path or None
         The traces of the regions as CSV; None without regions.
     movie : Path or None
         The video file to look at; None where none was asked for.
-    track : Track
-        Where the frames lie.
     window : int
         How many frames stand behind each.
-    notes : tuple of str
-        What a user should know.
-    quality : str
-        "good", or "doubtful" where the notes say why frames may lie wrong.
+    poses, track, bundle, gain_weights, notes, quality
+        As those of `napari_fiberburst.recordings.outcome.Outcome`.
     """
 
     path: Path
-    poses: Path
     traces: Path
     table: Path | None
     movie: Path | None
-    track: Track
     window: int
-    notes: tuple[str, ...]
-    quality: Literal["good", "doubtful"]
 
 
 def video(
@@ -222,6 +215,8 @@ def _written(plan: Plan, located: Located, target: Path) -> Video:
         table=None if plan.regions is None else table,
         movie=None,
         track=plan.track,
+        bundle=as_seen(located.work.bundle, plan.track),
+        gain_weights=plan.track.gain_weights,
         window=plan.window,
         notes=(*located.notes, *_remarks(plan)),
         quality=located.quality,
