@@ -213,6 +213,11 @@ class PathSampling:
         count = self._points.inside.shape[-1]
         return self._points.adjoint((values / count)[..., None].expand(*values.shape, count))
 
+    def with_slopes(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the means of an image (H, W), and of its slopes per pixel along x and along y; 0 outside."""
+        light, along_x, along_y = (part.mean(dim=-1) for part in self._points.with_slopes(image))
+        return light, along_x, along_y
+
     def of_channels(self, images: Tensor) -> Tensor:
         """Return the means of images (C, H, W), (..., C)."""
         return self._points.of_channels(images).mean(dim=-2)

@@ -54,6 +54,8 @@ class Again:
         self.coefficients, self.smoothness = solved.scene.coefficients, solved.scene.smoothness
         # Previews of the way are of no use any more.
         self.aligned = replace(aligned, scene=None, image=None, draft=None)
+        # Where frames were smeared, the draft is of other places than they were first aligned to.
+        self.placed = replace(self.aligned, registration=solved.registration)
         self._losses, self._seconds = losses, seconds
 
     def solve(self, *, smoothness: float | None = None, leave_out: Collection[int] = ()) -> Reconstruction:
@@ -64,7 +66,10 @@ class Again:
         is_same = order.method.leave_out == self.order.method.leave_out
         is_told = order.method.smoothness is not None or self.draft.smoothness is not None
         scenes = Scenes(order.acquisition, order.method, order.requested.seed)
-        fitted = drain(scenes.solve(self.aligned, self.draft if is_same and is_told else None))
+        if is_same and is_told:
+            fitted = drain(scenes.solve(self.placed, self.draft))
+        else:
+            fitted = drain(scenes.solve(self.aligned))
         took = time.perf_counter() - began
         return order.outcome(fitted, self._losses, "finished", self._seconds + took, self)
 
@@ -132,7 +137,7 @@ class Look:
         if self._assembled is not None and self._assembled[0] == method.leave_out:
             return self._assembled[1:]
         draft = self._again.draft
-        fitted = scenes.without_left_out(self._again.aligned)
+        fitted = scenes.without_left_out(self._again.placed)
         samples = fitted.samples
         assert samples is not None
         fitted = replace(fitted, canvas=scenes.canvas(fitted.registration, samples))

@@ -17,6 +17,8 @@ from napari_fiberburst.motion.registration import Registration
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.render import image_of
+from napari_fiberburst.scene.smeared_motion import refine_along
+from napari_fiberburst.scene.smoothness import UNTOLD
 from napari_fiberburst.scene.solve import Draft, Scene, drafting, finishing, grid_over, solve_quickly
 from napari_fiberburst.settings import SplineMethod
 
@@ -52,7 +54,7 @@ class Scenes:
         fitted : Fitted
             With samples, and with the motion of all frames.
         draft : Draft, optional
-            Of these samples, where there is one: less is left to do.
+            Of these samples where they lie, where there is one: less is left to do.
         """
         samples = fitted.samples
         assert samples is not None
@@ -63,6 +65,8 @@ class Scenes:
         if draft is None:
             steps = drafting(samples, fitted.registration, grid, is_asked=smoothness is None)
             fitted, draft = yield from self._drawn(fitted, steps)
+            if draft.smear is not None:
+                fitted, draft = yield from self._drawn_again(fitted, draft, grid)
         final = finishing(
             draft,
             samples,
@@ -74,6 +78,20 @@ class Scenes:
         )
         fitted, scene = yield from self._drawn(fitted, final)
         return replace(self.with_scene(fitted, scene), draft=draft)
+
+    def _drawn_again(self, fitted: Fitted, draft: Draft, grid: Grid) -> Generator[Fitted, None, tuple[Fitted, Draft]]:
+        """Find the motion of smeared frames again, and what can be learned of their samples where they then lie."""
+        samples, before = fitted.samples, fitted.registration
+        assert samples is not None
+        assert draft.smear is not None
+        registration = refine_along(
+            draft.refined(samples, before), before, grid, draft.smear, draft.coefficients, draft.smoothness or UNTOLD
+        )
+        if registration is before:
+            return fitted, draft
+        yield fitted
+        steps = drafting(samples, registration, grid, is_asked=self._method.smoothness is None)
+        return (yield from self._drawn(replace(fitted, registration=registration), steps))
 
     def without_left_out(self, fitted: Fitted) -> Fitted:
         """Leave those frames out that the method says."""

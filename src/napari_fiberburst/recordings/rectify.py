@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from napari_fiberburst.motion.step import MODELS
 from napari_fiberburst.recordings.refine import Refinement
-from napari_fiberburst.recordings.step import MODELS
 from napari_fiberburst.recordings.track import Track
 
 # The displacement is a polynomial of so many degrees, of the place in halves of the piece's longer side.

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.motion.step import MODELS, Seen, stepped
 from napari_fiberburst.operators.grid import Grid, Sampling
 from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.bending import Bend, basis, control_grid
 from napari_fiberburst.recordings.scene import corrected, equations, frames_together
-from napari_fiberburst.recordings.step import MODELS, Seen, stepped
 from napari_fiberburst.recordings.tiles import Tile, pieces_tiled
 from napari_fiberburst.recordings.traces import Traces, traced
 from napari_fiberburst.recordings.track import Track
@@ -161,7 +161,14 @@ def _compare(
     typical = rows.rms(residual, weights)[:, 0]
     robust = weights / (1 + (residual / (_ROBUST * typical[:, None])).square())
     slopes = along_x, along_y
-    step = stepped(track, frames, points, Seen(residual, robust, light, slopes))
+    step = stepped(
+        points,
+        Seen(residual, robust, light, slopes),
+        scene_from_frame=track.scene_from_frame[frames],
+        exposures=track.exposures[frames],
+        shape=track.shape,
+        dof=track.dof,
+    )
     bend = Bend(basis(track.shape, traces.template.positions), track.shape, robust, step.left, slopes, typical)
     control, told = None, np.full(len(frames), np.nan)
     if track.control is not None:

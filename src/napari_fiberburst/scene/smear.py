@@ -6,6 +6,7 @@ they were exposed: one number of the burst, found by how well the scene explains
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -19,10 +20,12 @@ from napari_fiberburst.scene.prediction import misfit, predict
 from napari_fiberburst.scene.spline import assemble
 from napari_fiberburst.scene.window import liveliest
 
+Way = Literal["to next", "to both"]
 # Points to a path.
 _MOMENTS = 5
 # Parts of a step that are tried, the first one without a smear; and the one by which the residuals are asked for any.
-_PARTS, _PROBED = (0.0, 0.25, 0.5, 0.75, 1.0), 0.5
+# No exposure lasts longer than a step, but a path that is no straight line may look longer.
+_PARTS, _PROBED = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25), 0.5
 # Residuals go with what a smear by half a step would do, by at least this factor. A scene that is smooth leaves some of
 # its detail in them, so that bursts that are not smeared have -0.12 to -2.3, and those smeared by two pixels 0.03 up.
 _LEAST_SCORE = -0.045
@@ -42,10 +45,13 @@ class Smear:
         Of a step, over which they moved.
     steps : Tensor
         (T, N, 2), where each sample's look went from one frame to the next, pixels of the scene.
+    way : "to next" or "to both"
+        Whether a frame moved as to the next one, or as from the one before to the next.
     """
 
     part: float
     steps: Tensor
+    way: Way = "to next"
 
     @property
     def length(self) -> float:
@@ -79,7 +85,7 @@ def find_smear(
         return None
     grey = replace(samples, values=samples.grey[..., None])
     light = filtered.mean(dim=0, keepdim=True)
-    ways = [Smear(_PROBED, steps) for steps in (_to_next(points, frames), _to_both(points, frames))]
+    ways = [_going(way, points, frames) for way in get_args(Way)]
     scores = [_score(grey, points, grid, light, way) for way in ways]
     if max(scores) < _LEAST_SCORE:
         return None
@@ -88,6 +94,16 @@ def find_smear(
     within = _within(window, grey, replace(way, part=_PARTS[-1]).paths(points))
     left = np.array([_left(within, replace(way, part=part).paths(points), window) for part in _PARTS])
     return replace(way, part=_lowest(left)) if left.min() < (1 - _LEAST_GAIN) * left[0] else None
+
+
+def going_on(smear: Smear, points: Tensor, frames: NDArray[np.intp]) -> Smear:
+    """Return the smear of frames that lie elsewhere, and moved in the same way for as long."""
+    return replace(_going(smear.way, points, frames), part=smear.part)
+
+
+def _going(way: Way, points: Tensor, frames: NDArray[np.intp]) -> Smear:
+    steps = (_to_next if way == "to next" else _to_both)(points, frames)
+    return Smear(_PROBED, steps, way)
 
 
 def _to_next(points: Tensor, frames: NDArray[np.intp]) -> Tensor:

@@ -7,8 +7,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.recordings.track import Track
-
 # Degrees of freedom: shifts, similarities, affine transforms.
 MODELS = (2, 4, 6)
 # That an exposure is 1 is known as well as the light of so many cores of full brightness would tell it.
@@ -68,10 +66,30 @@ class Step:
     left: Tensor
 
 
-def stepped(track: Track, frames: NDArray[np.int64], points: Tensor, seen: Seen) -> Step:
-    """Return the step of frames whose samples lie at points (n, N, 2) of the scene."""
+def stepped(
+    points: Tensor,
+    seen: Seen,
+    *,
+    scene_from_frame: NDArray[np.float64],
+    exposures: NDArray[np.float32],
+    shape: tuple[int, int],
+    dof: int,
+) -> Step:
+    """Return the step of frames whose samples lie at points (n, N, 2) of the scene.
+
+    Parameters
+    ----------
+    points, seen
+        The samples, and what the scene shows to them.
+    scene_from_frame, exposures : numpy.ndarray
+        (n, 3, 3) and (n,), as they are.
+    shape : (int, int)
+        Height and width of a frame.
+    dof : int
+        One of `MODELS`: how free frames are.
+    """
     weights, (along_x, along_y) = seen.weights, seen.slopes
-    half = max(track.shape) / 2
+    half = max(shape) / 2
     middle = (points * weights[..., None]).sum(dim=1) / weights.sum(dim=1).clamp_min(1e-9)[:, None]
     x, y = ((points - middle[:, None]) / half).unbind(dim=-1)
     turns = [x * along_x + y * along_y, x * along_y - y * along_x]
@@ -84,10 +102,10 @@ def stepped(track: Track, frames: NDArray[np.int64], points: Tensor, seen: Seen)
     rhs = (weighted @ seen.residual[..., None])[..., 0]
     steps = {dof: torch.linalg.solve(normal[:, : dof + 1, : dof + 1], rhs[:, : dof + 1]) for dof in MODELS}
     lowered = [(step * rhs[:, : step.shape[1]]).sum(dim=1) for step in steps.values()]
-    taken = torch.nn.functional.pad(steps[track.dof], (0, MODELS[-1] - track.dof))
+    taken = torch.nn.functional.pad(steps[dof], (0, MODELS[-1] - dof))
     return Step(
-        exposures=_exposed(track.exposures[frames], taken),
-        scene_from_frame=_change(taken.double().numpy(), middle.double().numpy()) @ track.scene_from_frame[frames],
+        exposures=_exposed(exposures, taken),
+        scene_from_frame=_change(taken.double().numpy(), middle.double().numpy()) @ scene_from_frame,
         lowered=torch.stack([(lowered[1] - lowered[0]) / 2, (lowered[2] - lowered[1]) / 2], dim=1).double().numpy(),
         strain=steps[MODELS[-1]][:, 3:].double().numpy(),
         information=1 / torch.linalg.inv(normal).diagonal(dim1=1, dim2=2)[:, 3:].double().numpy(),
