@@ -56,3 +56,14 @@ def test_without_cores_there_is_nothing_to_measure_by():
     assert not bundle.is_resolved
     samples = sample(burst, bundle, device="cpu")
     assert measure_noise(torch.from_numpy(burst.frames).mean(dim=3), bundle, burst, samples) is None
+
+
+def test_the_dark_is_not_without_noise_where_the_light_is_noisier_than_shot_noise(rng):
+    """As of profiles that are slightly wrong: their error grows with the square of the light."""
+    _, bundle, burst, samples = measured(1e7)
+    grey = torch.from_numpy(burst.frames).mean(dim=3)
+    grey = grey * (1 + 0.05 * torch.from_numpy(rng.standard_normal(grey.shape)).float())
+    rounded = torch.round(255 * grey) / 255
+    noise = measure_noise(rounded, bundle, burst, samples)
+    assert noise.read >= 1 / 255**2 / 12 * 0.99
+    assert 0 < measure_noise(grey, bundle, burst, samples).read < noise.read

@@ -19,6 +19,8 @@ _LIT = 0.3
 _MOST_PIXELS = 40_000
 # Brightness is told apart in so many steps.
 _STEPS = 12
+# The dark has at least this part of the least noise that is seen anywhere.
+_LEAST_READ = 0.1
 # The median of the square of a normal variable of variance 1.
 _MEDIAN_SQUARE = 0.4549
 
@@ -91,11 +93,21 @@ def measure_noise(grey: Tensor, bundle: Bundle, acquisition: Acquisition, sample
     own = (1 - known.transmission[y, x] ** 2 / power[labels].clamp_min(1e-9)).clamp_min(0.05)
     square = (left**2).sum(dim=0) / ((count - 2).clamp_min(1) * own)
     brightness = (usable * light).sum(dim=0) / count.clamp_min(1) - known.black
-    return _line(brightness[enough].cpu().double(), square[enough].cpu().double(), len(grey))
+    return _line(brightness[enough].cpu().double(), square[enough].cpu().double(), len(grey), _of_rounding(light))
 
 
-def _line(light: Tensor, square: Tensor, count: int) -> Noise | None:
-    """Return the line of variance over light through the medians of steps of brightness."""
+def _of_rounding(light: Tensor) -> float:
+    """Return the variance that rounding to the steps of these numbers has; next to nothing where they have none."""
+    levels = torch.unique(light)
+    return float(levels.diff().median()) ** 2 / 12 if len(levels) > 1 else 0.0
+
+
+def _line(light: Tensor, square: Tensor, count: int, rounding: float) -> Noise | None:
+    """Return the line of variance over light through the medians of steps of brightness.
+
+    A profile that is slightly wrong adds variance where there is much light, so that the line may go below 0 in the
+    dark. No camera is without noise there, and cores before dark parts of the object would be held to none.
+    """
     if len(light) < 10 * _STEPS:
         return None
     order = light.argsort()
@@ -109,6 +121,8 @@ def _line(light: Tensor, square: Tensor, count: int) -> Noise | None:
     shot, read = torch.linalg.solve(design.T @ design, design.T @ (y * weight)).tolist()
     if shot < 0:
         return Noise(shot=0.0, read=float(y.mean()))
-    if read < 0:
-        return Noise(shot=float((x * y).sum() / (x * x).sum()), read=0.0)
+    least = max(rounding, _LEAST_READ * float(y.min()))
+    if read < least:
+        above = (y - least).clamp_min(0)
+        return Noise(shot=float((weight**2 * x * above).sum() / (weight**2 * x * x).sum()), read=least)
     return Noise(shot=shot, read=read)

@@ -1,5 +1,7 @@
 """Frames that repeat the one before, as recorders write where their camera is slower than they are."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import percentile_filter
@@ -56,9 +58,14 @@ def find_doubled(source: FrameSource) -> NDArray[np.int64]:
                 difference = np.subtract(frame, before, dtype=np.float32)
                 differences[number] = max(np.sqrt(np.mean(np.square(difference))), np.finfo(float).tiny)
             before = frame
-    is_doubled = differences == 0
-    if source.acquisition.dtype.itemsize == 1 and len(source) > 1:
+    return np.flatnonzero(are_doubled(differences, source.acquisition.dtype))
+
+
+def are_doubled(differences: NDArray[np.floating], dtype: np.dtype[Any]) -> NDArray[np.bool_]:
+    """Return which frames (T,) are doubled, by how far each is from the one before it, root mean square, in levels."""
+    doubled: NDArray[np.bool_] = differences == 0
+    if dtype.itemsize == 1 and len(doubled) > 1:
         usual = percentile_filter(differences[1:], _QUARTER, size=_NEAR, mode="nearest")
-        is_doubled[1:] |= (differences[1:] < _LEVEL) & (differences[1:] < _OF_USUAL * usual)
-    is_doubled[0] = False
-    return np.flatnonzero(is_doubled)
+        doubled[1:] |= (differences[1:] < _LEVEL) & (differences[1:] < _OF_USUAL * usual)
+    doubled[0] = False
+    return doubled

@@ -53,7 +53,7 @@ def judged(found: Registration, samples: Samples) -> Registration:
     if used.sum() < 2:
         return found
     for left_out, which in (
-        (~shows, "frames that show nothing, because they are black or over-exposed,"),
+        (~shows, "frames that show nothing new, because they are black, over-exposed or copies,"),
         (shows & ~used, "frames that could not be registered"),
     ):
         if left_out.any():

@@ -37,6 +37,7 @@ from napari_fiberburst.motion.registration import Registration, unregistered
 from napari_fiberburst.motion.trust import MOST_UNEXPLAINED
 from napari_fiberburst.pipeline.fitted import Fitted
 from napari_fiberburst.pipeline.remeasure import lit, remeasured
+from napari_fiberburst.pipeline.repeated import find_repeated
 from napari_fiberburst.pipeline.scenes import Scenes
 from napari_fiberburst.scene.offsets import find_offsets
 from napari_fiberburst.scene.outliers import find_outliers
@@ -96,7 +97,8 @@ class Stages:
             )
         self._burst, self._method, self._seed, self._given, self._limit = burst, method, seed, given, limit
         self._scenes = Scenes(burst.acquisition, method, seed)
-        self._frames = torch.from_numpy(burst.frames).to(device)
+        self._recorded = _without_copies(burst).to(device)
+        self._frames = self._recorded
         self._grey = in_grey(self._frames)
         self._marks = find_marks(only_exposed(self._grey))
         self._taken: tuple[Bundle, dict[int, Samples]] | None = None
@@ -121,7 +123,7 @@ class Stages:
         """Calibrate and register frames in which the bundle is brought to rest."""
         steadied: tuple[str, ...] = ()
         if mount is not None:
-            self._frames = mount.steadied(torch.from_numpy(self._burst.frames).to(self._frames))
+            self._frames = mount.steadied(self._recorded)
             self._grey = in_grey(self._frames)
             self._taken = None
             steadied = (_warned(mount.note),)
@@ -451,3 +453,12 @@ def _seen(samples: Samples, mount: Mount | None) -> Samples:
 def _warned(text: str) -> str:
     logger.warning(text)
     return text
+
+
+def _without_copies(burst: Burst) -> Tensor:
+    """Return the frames (T, H, W, C), black where they repeat another one, so that they count as those do."""
+    frames, repeated = torch.from_numpy(burst.frames), find_repeated(burst)
+    if repeated.any():
+        frames = frames.clone()
+        frames[torch.from_numpy(repeated)] = 0
+    return frames

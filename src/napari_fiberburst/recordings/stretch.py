@@ -117,9 +117,10 @@ class _Stretch:
     def placed(self, frame: int) -> NDArray[np.float32]:
         """Return a frame that has a place, (C, H, W) in [0, 1] above black."""
         plan, track = self._plan, self._plan.track
-        grid = view_of(track, frame, _MARGIN * self._work.bundle.pitch)
+        margin = _MARGIN * self._work.bundle.pitch
+        grid = view_of(track, frame, margin)
         equations = self._window.about(frames_about(track, frame, plan.window), grid)
-        start = None if self._before is None else _moved(*self._before, grid)
+        start = None if self._before is None else _start(*self._before, equations, round(margin))
         scene = equations.solve(plan.smoothness, start, _FIRST_ITERATIONS if start is None else _ITERATIONS)
         self._before = grid, scene
         image = equations.image(scene, plan.smoothness)
@@ -191,15 +192,22 @@ class _Stretch:
         return found
 
 
-def _moved(grid: Grid, scene: Tensor, other: Grid) -> Tensor:
-    """Return a scene (C, H, W) on another grid, at whole nodes; what is at its edge is repeated beyond."""
+def _start(grid: Grid, scene: Tensor, equations: NormalEquations, margin: int) -> Tensor:
+    """Return where to begin: the scene of the frame before (C, H, W) where that was seen, the local mean elsewhere.
+
+    In its margin, of so many nodes, that scene was solved from hardly anything, and would need many iterations.
+    """
+    wanted = equations.grid
     rows, columns = (
-        (torch.arange(count) + round(start - first)).clamp(0, last - 1)
-        for count, start, first, last in zip(
-            other.shape, (other.y0, other.x0), (grid.y0, grid.x0), grid.shape, strict=True
-        )
+        torch.arange(count) + round(start - first)
+        for count, start, first in zip(wanted.shape, (wanted.y0, wanted.x0), (grid.y0, grid.x0), strict=True)
     )
-    return scene[:, rows][:, :, columns]
+    height, width = grid.shape
+    seen_rows, seen_columns = (
+        (place >= margin) & (place < side - margin) for place, side in ((rows, height), (columns, width))
+    )
+    before = scene[:, rows.clamp(0, height - 1)][:, :, columns.clamp(0, width - 1)]
+    return torch.where(seen_rows[:, None] & seen_columns, before, equations.local_mean())
 
 
 def near_cores(pixels: NDArray[np.float64], centres: NDArray[np.floating], reach: float) -> NDArray[np.bool_]:

@@ -191,7 +191,7 @@ class NormalEquations:
             multiply,
             (self.through(self.rhs),),
             lambda blocks: (inverse * blocks[0],),
-            start=(self._start() if start is None else start,),
+            start=(self.local_mean() if start is None else start,),
             iterations=iterations,
             tolerance=_TOLERANCE,
             inner=inner_of_images,
@@ -244,7 +244,7 @@ class NormalEquations:
         level = torch.stack([steady.total(channel) for channel in self.rhs]) / mass.clamp_min(1e-12)
         return level[:, None, None].expand(-1, *self.grid.shape).clone()
 
-    def _start(self) -> Tensor:
+    def local_mean(self) -> Tensor:
         """Return a scene to start from, (C, H, W): the local mean of the samples, wider where there are few."""
         return filled_mean(self.rhs, self.density(), max((self.radius or 0.0) / self.grid.spacing, 1.0))
 
