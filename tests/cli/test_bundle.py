@@ -69,7 +69,7 @@ def test_calibrate_takes_images_in_even_light_or_a_burst(files, given, source, f
         (["calibrate", "flat.tif", "flat.tif", "-o", "a.bundle"], "add --even"),
         (["calibrate", "burst.tif", "--dark", "dark.tif", "-o", "a.bundle"], "add --even, or leave --dark out"),
         (["calibrate", "none.tif", "-o", "a.bundle"], "there is no none.tif"),
-        (["calibrate", "none.png", "-o", "a.bundle"], "got none.png"),
+        (["calibrate", "none.png", "-o", "a.bundle"], "there is no none.png"),
         (["calibrate", "flat.tif", "-o", "a.npz"], "ending in .bundle"),
         (["calibrate", "flat.tif", "-o", "nowhere/a.bundle"], "the folder nowhere does not exist"),
         (["calibrate", "dark.tif", "-o", "a.bundle"], "shows no bundle"),

@@ -19,7 +19,7 @@ def words(clip, tmp_path):
 def test_an_output_is_replaced_only_where_that_is_asked_for(words, tmp_path, capsys):
     assert main(words) == 0
     told = capsys.readouterr().out
-    assert "frames placed 12 of 12, in 1 pieces" in told
+    assert "frames placed 12 of 12, in one piece" in told
     assert "m.poses.csv" in told
     (tmp_path / "m.ome.zarr" / "old").touch()
     assert main(words) == 2

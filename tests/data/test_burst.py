@@ -147,8 +147,8 @@ def test_one_image_is_a_burst_of_one_frame(rng, image, axes, shape):
 
 def bad_frames():
     ramp = np.arange(3 * 20 * 20.0).reshape(3, 20, 20)
-    yield "a number", 3.0, "frames of one shape"
-    yield "ragged", [ramp[0], ramp[1, :-1]], "crop the frames to one size"
+    yield "a number", 3.0, "a list of frames, or a path; got 3.0"
+    yield "ragged", [ramp[0], ramp[1, :-1]], r"shapes \(19, 20\), \(20, 20\); crop them to one size"
     yield "five axes", ramp[:, :, :, None, None], 'axes="CTYX"'
     yield "NaN", np.where(ramp == 450, np.nan, ramp), "frame 1 holds NaN or infinity"
     yield "infinity", np.where(ramp == 450, np.inf, ramp), "finite"

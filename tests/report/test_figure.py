@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from napari_fiberburst import Burst, write_figure
+from napari_fiberburst import Burst, write_figure, write_report
 from napari_fiberburst.cli import main
 from napari_fiberburst.data.canvas import Canvas
 from napari_fiberburst.errors import OutputError
@@ -75,8 +75,16 @@ def test_its_scale_bars_are_as_long_as_they_say(result, burst, tmp_path):
         assert at["y"] < float(bar.get("y")) < at["y"] + at["height"]
     assert "2 µm" in words
     pixels = Burst(burst.frames[..., 0])
-    in_pixels = replace(result, acquisition=replace(result.acquisition, pixel_size=None, unit=None))
+    in_pixels = replace(result, acquisition=pixels.acquisition)
     assert "10 px" in pictures_and_words(write_figure(in_pixels, pixels, tmp_path / "pixels.svg"))[2]
+
+
+def test_another_burst_is_not_shown_beside_a_result(result, burst, tmp_path):
+    other = Burst(burst.frames[:-1], black_level=0, white_level=1)
+    for write, name in ((write_figure, "figure.svg"), (write_report, "report.html")):
+        with pytest.raises(OutputError, match=r"from another burst \(5 frames"):
+            write(result, other, tmp_path / name)
+        assert not (tmp_path / name).exists()
 
 
 def test_its_caption_says_what_the_image_rests_on(result, burst, tmp_path):

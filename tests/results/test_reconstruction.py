@@ -162,6 +162,11 @@ def test_homographies_that_say_nothing_are_none_in_json(result):
     assert told["homographies"][0] == np.eye(3).tolist()
 
 
+def test_it_is_told_in_a_line(result):
+    assert repr(result).startswith("Reconstruction(")
+    assert len(repr(result)) < 100
+
+
 def test_a_saved_representation_draws_the_same_image(result, tmp_path):
     path = result.save(tmp_path / "scene.npz")
     again = load(path, device="cpu")

@@ -73,7 +73,8 @@ def run(options: argparse.Namespace) -> int:
         source.shape,
         lambda client: mosaicking(source, options.output, bundle=bundle, dof=FREEDOM[options.motion], client=client),
     )
-    print(f"frames placed {int((found.track.piece >= 0).sum())} of {len(found.track)}, in {found.track.pieces} pieces")
+    placed, pieces = int((found.track.piece >= 0).sum()), found.track.pieces
+    print(f"frames placed {placed} of {len(found.track)}, in {'one piece' if pieces == 1 else f'{pieces} pieces'}")
     if found.resolution is not None:
         print(f"finest detail {found.resolution:.1f} px: down to it, two halves of the frames agree")
     reasons = f": {'; '.join(found.notes)}" if found.notes else ""

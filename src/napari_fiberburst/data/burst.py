@@ -194,11 +194,17 @@ _set = object.__setattr__
 
 def _stack(frames: Any) -> NDArray[Any]:
     try:
-        return np.stack([np.asarray(frame) for frame in frames])
-    except (TypeError, ValueError) as error:
+        parts = [np.asarray(frame) for frame in frames]
+    except TypeError as error:
         raise BurstError(
-            f"a burst needs frames of one shape in one stack, got {type(frames).__name__} ({error}); "
-            "crop the frames to one size"
+            f"a burst is an array (time, height, width[, channel]), a list of frames, or a path; got {frames!r:.80}"
+        ) from error
+    try:
+        return np.stack(parts)
+    except ValueError as error:
+        shapes = ", ".join(str(shape) for shape in sorted({part.shape for part in parts})[:4])
+        raise BurstError(
+            f"a burst needs frames of one shape; got {len(parts)} of the shapes {shapes}; crop them to one size"
         ) from error
 
 
@@ -215,7 +221,7 @@ def check_size(shape: tuple[int, ...]) -> None:
     if min(shape[1:3]) < MIN_SIDE or shape[3] < 1:
         raise BurstError(
             f"frames need at least {MIN_SIDE} pixels a side, got {shape[1]} x {shape[2]} with {shape[3]} channels; "
-            'if the axes stand in another order, name them, such as axes="CTYX"'
+            'if the axes stand in another order, name them: Burst(frames, axes="TCYX"), read_burst(path, axes="TCYX")'
         )
     check_frame(*shape[1:])
 

@@ -48,8 +48,8 @@ class Layout:
         if not set("YX" if is_one_frame else "TYX") <= set(order) or not len(set(order)) == len(order) == len(shape):
             raise BurstError(
                 "a burst is one stack with axes (time, height, width) or (time, height, width, channel); got shape "
-                f"{tuple(shape)} with axes {order or 'unknown'}; open the frames as one stack, or name its axes, "
-                'such as axes="CTYX"'
+                f"{tuple(shape)} with axes {order or 'unknown'}; open the frames as one stack, or name its axes: "
+                'Burst(stack, axes="CTYX"), read_burst(path, axes="CTYX")'
             )
         sizes = dict(zip(order, shape, strict=True))
         for axis in order:

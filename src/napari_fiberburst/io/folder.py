@@ -74,6 +74,8 @@ def read_image(path: str | Path) -> NDArray[Any]:
     """
     file = Path(path)
     endings = (*IMAGE_ENDINGS, ".npy")
+    if file.suffix.lower() in endings and not file.exists():
+        raise BurstError(f"there is no {path}; give an image that is there")
     if file.suffix.lower() not in endings or not file.is_file():
         raise BurstError(f"expected the file of an image, ending in {', '.join(endings)}; got {path}")
     try:

@@ -178,8 +178,8 @@ def read_representation(path: str | Path) -> tuple[dict[str, NDArray[Any]], dict
         raise
     except Exception as error:  # a damaged archive fails in zipfile, zlib, numpy or json
         raise OutputError(
-            f"{path} is no saved reconstruction ({type(error).__name__}: {error}); expected a .npz file written by "
-            "Reconstruction.save"
+            f"{path} is no saved reconstruction, or is damaged; expected a .fiberburst or .npz file written by "
+            "Reconstruction.save (a bundle is opened by Bundle.load)"
         ) from error
 
 

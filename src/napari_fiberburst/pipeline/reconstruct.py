@@ -62,7 +62,8 @@ def reconstruct(
         Where settings come from that are None here: "auto" calibrates the bundle from the burst, registers the frames
         and solves the scene; "paper" is the published method; or settings, such as those of another result.
     motion : str or Motion, optional
-        "translation", "similarity", "affine", "homography", "none", "flow" or "flow_tv", or a settings object.
+        "auto", "translation", "similarity", "affine", "homography", "deformable" or "none", or of a network "flow" or
+        "flow_tv"; or a settings object.
     encoding : str or Encoding, optional
         "spline", or a network: "none", "nerf", "fourier", "hash", "siren"; or a settings object.
     sigma : float, optional
@@ -100,8 +101,11 @@ def reconstruct(
     checkpoint_every : float
         Seconds from one to the next.
     **more
-        Any other parameter of `Settings`, or of the method, motion or encoding chosen, by name: ``learning_rate=1e-3``,
-        ``features=128``, ``preview_every=1.0``.
+        Any other parameter of `Settings`, or of the method, motion or encoding chosen, by name. Of the spline among
+        others ``smoothness``, ``upsample`` (pixels of the image to one of a frame), ``canvas`` ("frame", or "union" of
+        all that frames saw), ``fill`` (also where no core has looked), ``flatten`` ("motion", "frame" or "none"),
+        ``leave_out`` (numbers of frames); of networks ``learning_rate``, ``features``; of all ``memory`` ("4 GB"),
+        ``preview_every`` (seconds). The page *Settings* of the documentation has all of them.
 
     Returns
     -------

@@ -11,7 +11,7 @@ from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.picture import as_picture, limits_of
 from napari_fiberburst.io.results import check_place, write_whole
-from napari_fiberburst.report.facts import extent_of, field_of, in_words, number_used, scale_of
+from napari_fiberburst.report.facts import check_made_from, extent_of, field_of, in_words, number_used, scale_of
 from napari_fiberburst.report.figures import round_below
 from napari_fiberburst.report.sheet import PngSheet, Sheet, SvgSheet
 from napari_fiberburst.results.reconstruction import Reconstruction
@@ -67,9 +67,11 @@ def write_figure(result: Reconstruction, burst: Burst, path: str | Path) -> Path
     Raises
     ------
     OutputError
-        The ending is neither of these, or the folder does not exist or cannot be written.
+        The ending is neither of these, or the folder does not exist or cannot be written; or the result was made from
+        another burst.
     """
     target = check_figure(path)
+    check_made_from(result, burst)
     frame = burst.in_original_units(burst.frames[result.reference])
     extents = field_of(result), extent_of(result)
     limits = _limits(frame, result.image)

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from napari_fiberburst.data.burst import Burst
+from napari_fiberburst.errors import OutputError
 from napari_fiberburst.results.reconstruction import Reconstruction
 
 
@@ -32,3 +34,20 @@ def in_words(result: Reconstruction, pixels: float) -> str:
     """Return a length in frame pixels and, where it is known, in the unit of the burst."""
     pixel, unit = scale_of(result).values()
     return f"{pixels:.1f} px" if unit == "px" else f"{pixels:.1f} px = {pixels * pixel:.3g} {unit}"
+
+
+def check_made_from(result: Reconstruction, burst: Burst) -> None:
+    """Refuse to show a burst beside a result that was made from another one, as far as shape and levels tell.
+
+    Raises
+    ------
+    OutputError
+        It was.
+    """
+    made, given = (
+        f"{one.shape[0]} frames of {one.shape[1]} x {one.shape[2]} with {one.shape[3]} channels, {one.dtype}, levels "
+        f"{one.black_level:g} to {one.white_level:g}"
+        for one in (result.acquisition, burst)
+    )
+    if made != given:
+        raise OutputError(f"the result was made from another burst ({made}) than is given ({given}); give that one")

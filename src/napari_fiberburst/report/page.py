@@ -15,7 +15,7 @@ from napari_fiberburst.errors import OutputError
 from napari_fiberburst.io.picture import as_picture, limits_of
 from napari_fiberburst.io.results import check_place, versions, write_whole
 from napari_fiberburst.quality.resolution import THRESHOLD
-from napari_fiberburst.report.facts import extent_of, field_of, in_words, number_used, scale_of
+from napari_fiberburst.report.facts import check_made_from, extent_of, field_of, in_words, number_used, scale_of
 from napari_fiberburst.report.figures import Chart, path_of, picture
 from napari_fiberburst.results.reconstruction import Reconstruction
 
@@ -79,9 +79,11 @@ def write_report(
     Raises
     ------
     OutputError
-        The ending is not .html, or the folder does not exist or cannot be written.
+        The ending is not .html, or the folder does not exist or cannot be written; or the result was made from
+        another burst.
     """
     target = check_report(path)
+    check_made_from(result, burst)
     style = files("napari_fiberburst.report").joinpath("style.css").read_text(encoding="utf-8")
     title = escape(f"{name}: a reconstruction")
     parts = [_head(result, name), _verdict(result), _before_and_after(result, burst), _facts(result), _charts(result)]

@@ -139,6 +139,12 @@ class Reconstruction(Diagnostics):
     solver: Solver | None = field(default=None, repr=False)
     made_with: Mapping[str, Any] = field(default_factory=versions, repr=False)
 
+    def __repr__(self) -> str:
+        """Return what it is in a line: its arrays would fill screens."""
+        shape = " x ".join(map(str, self.image.shape))
+        told = "" if self.quality is None else f", {self.quality}"
+        return f"Reconstruction({shape} of {self.acquisition.shape[0]} frames, {self.ending}{told})"
+
     @property
     def compression(self) -> float:
         """1 - bytes of the parameters as float32 / bytes of the burst as it came; below 0 it takes more room."""
