@@ -60,6 +60,7 @@ def score(outcome: Outcome, simulated: SimulatedBurst) -> Row:
         "compression": outcome.compression,
         "curve": outcome.curve,
         "notes": outcome.notes,
+        "quality": outcome.quality,
     }
     if outcome.homographies is not None:
         row["motion_error"] = motion_error(outcome.homographies, simulated.homographies, truth.shape[:2])

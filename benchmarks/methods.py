@@ -74,6 +74,8 @@ class Outcome:
         Seconds and PSNR of its previews, where it has any.
     notes : tuple of str
         What it says itself of its image.
+    quality : str or None
+        Its own verdict, where it has one.
     """
 
     image: Image
@@ -82,6 +84,7 @@ class Outcome:
     compression: float | None = None
     curve: list[tuple[float, float]] = field(default_factory=list)
     notes: tuple[str, ...] = ()
+    quality: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,6 +314,7 @@ def _outcome(
         compression=result.compression,
         curve=curve,
         notes=result.notes,
+        quality=result.quality,
     )
 
 

@@ -1,7 +1,7 @@
 """Table 6: what the faults of recorded bursts cost, one by one and all together.
 
 Every burst has the scene, motion and bundle of a clean one, on which the default is measured too, so that a line says
-what its fault costs. Only what is visible of frame 0 counts, in the clean burst as well: not what lies outside a round
+what its fault costs; and the oracle, which is told everything but the scene, says what of that nobody could get back. Only what is visible of frame 0 counts, in the clean burst as well: not what lies outside a round
 field or under a burned-in mark. A method that refuses a burst has its reason in its row.
 """
 
@@ -16,7 +16,7 @@ from benchmarks.results import RECORDED, Recorder
 from benchmarks.rows import Row
 from napari_fiberburst.errors import FiberBurstError
 
-SHOWN = ("default", "gaussian", "pyfibrebundle", "pyfibrebundle-sr")
+SHOWN = ("default", "oracle", "gaussian", "pyfibrebundle", "pyfibrebundle-sr")
 # The default on the same burst without its faults.
 CLEAN = "clean"
 
