@@ -1,8 +1,9 @@
 """Table 6: what the faults of recorded bursts cost, one by one and all together.
 
 Every burst has the scene, motion and bundle of a clean one, on which the default is measured too, so that a line says
-what its fault costs; and the oracle, which is told everything but the scene, says what of that nobody could get back. Only what is visible of frame 0 counts, in the clean burst as well: not what lies outside a round
-field or under a burned-in mark. A method that refuses a burst has its reason in its row.
+what its fault costs; and the oracle, which is told everything but the scene, says what of that nobody could get back.
+Only what is visible of frame 0 counts, in the clean burst as well: not what lies outside a round field or under a
+burned-in mark. A method that refuses a burst has its reason in its row.
 """
 
 from collections.abc import Sequence
