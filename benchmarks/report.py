@@ -247,7 +247,7 @@ def _recorded(results: Results) -> list[str]:
         f"Faults of recorded bursts, one by one at three strengths, and a mild one of each. {burst['physics']} bundle, "
         f"{burst['frames']} x {burst['side']} x {burst['side']}, pitch {burst['pitch']:g}. PSNR dB / SSIM of what is "
         "visible of frame 0, our verdict, and how far our homographies are off, with the frames used; a deformation is "
-        "not in them. The oracle is our solver, told everything but the scene: what it loses, the fault has taken away. "
+        "not in them. The oracle is our solver, told all but the scene: what it loses, the fault has taken away. "
         + _measured(rows),
         table(["", *(labels[name] for name in names), "our verdict", "our motion"], lines),
     ]

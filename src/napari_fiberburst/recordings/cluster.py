@@ -102,7 +102,7 @@ def _started(count: int, need: int) -> Iterator[Any]:
                 memory_limit=max(need, MEMORY_LIMIT // count),
                 # Without a dashboard its port is asked for all the same, and two commands at once would both want 8787.
                 scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                silence_logs=False,
+                silence_logs=logging.CRITICAL,
             )
             client = Client(opened.enter_context(cluster))  # type: ignore[no-untyped-call]
         except (RuntimeError, OSError) as error:
