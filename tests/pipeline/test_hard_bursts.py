@@ -125,8 +125,7 @@ def test_a_duplicated_frame_does_no_harm(cores, fitted):
         frames[5] = frames[4]
 
     result = reconstruct(recorded(cores, double), fill=True)
-    assert result.frames_used == tuple(range(12))
-    np.testing.assert_allclose(result.homographies[4], result.homographies[5], atol=0.05)
+    assert result.frames_used == tuple(number for number in range(12) if number != 5)
     assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.0
 
 
@@ -229,7 +228,7 @@ def test_a_calibration_image_may_be_a_file_and_is_cropped_along(cores, tmp_path)
     ("choices", "error", "said"),
     [
         ({"calibration": np.zeros((27, 29))}, BundleError, "is black"),
-        ({"calibration": "no such file.png"}, BundleError, "got no such file.png"),
+        ({"calibration": "no such file.png"}, BundleError, "there is no no such file.png"),
         ({"preset": "paper", "calibration": np.eye(27)}, SettingsError, "no model of the bundle"),
         ({"motion": "flow"}, SettingsError, "needs a network"),
     ],

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from napari_fiberburst.bundle.black import black_between_cores
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.cores import brightest, find_cores, find_gaps, footprint_radius
 from napari_fiberburst.bundle.field import find_field, find_marks, widened, without_rim
 from napari_fiberburst.bundle.lattice import REACH, nearest_core
-from napari_fiberburst.bundle.pitch import find_pitch, is_faint
+from napari_fiberburst.bundle.pitch import find_pitch
 from napari_fiberburst.bundle.samples import SATURATED, only_exposed, sample_cores
 from napari_fiberburst.data.burst import Acquisition, Burst
 from napari_fiberburst.device import find_device
@@ -39,6 +40,8 @@ _LEAST_CORES = 20
 _DARK = 0.04
 # The black level is this quantile of the mean frame: the space between cores, or outside the field.
 _BLACK_QUANTILE = 0.002
+# In even light, the space between cores is black where it has less than this part of a bright place's light.
+_DARK_BESIDE = 0.25
 # Pixels: over this much what lies under marks is filled in, for cores to be found beside them.
 _FILLED_FROM = 1.0
 # In pitches: a core's footprint before its profile has been measured.
@@ -86,7 +89,7 @@ def calibrating(grey: Tensor, acquisition: Acquisition, marks: Tensor) -> Genera
     mean = grey.mean(dim=0)
     field = find_field(grey, find_pitch(mean))
     mean = torch.where(marks, local_mean(mean, _FILLED_FROM, (~marks).to(mean)), mean)
-    bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin, field)), grey)
+    bundle = with_saturated((yield from calibrating_mean(mean, acquisition, origin, field, frames=grey)), grey)
     return bundle.masked(marks.cpu().numpy())
 
 
@@ -105,12 +108,14 @@ def calibrating_mean(
     provenance: dict[str, Any],
     field: Tensor | None = None,
     *,
+    frames: Tensor | None = None,
     even_light: bool = False,
 ) -> Generator[str, None, Bundle]:
     """Calibrate the bundle from one image of it (H, W) in [0, 1]; yields the name of each step that is done.
 
     In even light the image is the transmission; otherwise its slow changes are divided out of it. Outside the field
-    (H, W), by default all of the image, there is no bundle.
+    (H, W), by default all of the image, there is no bundle. Frames (T, H, W) of which it is the mean tell the black
+    level better than it does.
     """
     field = torch.ones_like(mean, dtype=torch.bool) if field is None else field
     told = {**provenance, "date": datetime.now(UTC).strftime("%Y-%m-%d"), "version": _version()}
@@ -121,7 +126,7 @@ def calibrating_mean(
     plain = _blocks(torch.ones_like(mean), inner, acquisition, pattern="none", black=0.0, provenance=told)
     if pitch is None:
         return plain
-    black = _black_level(mean, pitch, field)
+    black = _black_level(mean, pitch, field, frames)
     # The outermost cores shine beyond the field.
     reached = widened(field, pitch)
     light = (mean - black).clamp_min(0) * reached
@@ -237,15 +242,20 @@ def _version() -> str:
         return "unknown"
 
 
-def _black_level(mean: Tensor, pitch: float, field: Tensor) -> float:
-    """Return the intensity without light in a mean frame (H, W), full scale 1.
+def _black_level(mean: Tensor, pitch: float, field: Tensor, frames: Tensor | None) -> float:
+    """Return the intensity without light in a mean frame (H, W) of frames (T, H, W), full scale 1.
 
-    A bundle is black between its cores and about its field. A faint one that fills the frame shows no black at all: its
-    darkest place is as bright as the object there, so the black level of the recording has to do.
+    A bundle is black about its field. One that fills the frame may be black between its cores, or show no black at all.
+    Where that cannot be told, as of the faintest, the black level of the recording has to do; in an image in even
+    light, what is between the cores is black where it is dark beside them.
     """
-    if bool(field.all()) and is_faint(mean, pitch, field):
-        return 0.0
-    return float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
+    darkest = float(torch.quantile(thinned(mean), _BLACK_QUANTILE))
+    if not bool(field.all()) or pitch < LEAST_RESOLVED_PITCH:
+        return darkest
+    if frames is None:
+        return darkest if darkest < _DARK_BESIDE * float(torch.quantile(thinned(mean), 0.95)) else 0.0
+    told = black_between_cores(frames, pitch, field)
+    return 0.0 if told is None else min(max(told, 0.0), darkest)
 
 
 def _blocks(

@@ -69,11 +69,6 @@ def ring_frequency(pitch: float) -> float:
     return _PITCH_PER_ROW / pitch
 
 
-def is_faint(image: Tensor, pitch: float, field: Tensor) -> bool:
-    """Whether the space between cores is nearly as bright as they are, in the field of an image (H, W)."""
-    return _contrast(image, pitch, field.to(image)) < _FAINT
-
-
 def _contrast(image: Tensor, pitch: float, weight: Tensor) -> float:
     """Return the standard deviation of an image about its own blur over three pitches, in parts of that."""
     envelope = local_mean(image, 3 * pitch, weight)
