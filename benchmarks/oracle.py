@@ -19,7 +19,7 @@ from torch import Tensor
 from benchmarks.cases import Case
 from napari_fiberburst import Bundle, Registration, render, solve
 from napari_fiberburst.bundle.mount import Mount
-from napari_fiberburst.bundle.samples import sample_cores, sample_pixels
+from napari_fiberburst.bundle.samples import SATURATED, sample_cores, sample_pixels
 from napari_fiberburst.device import find_device
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.simulation import SimulatedBurst
@@ -35,7 +35,9 @@ def told_everything(case: Case, simulated: SimulatedBurst, device: str) -> NDArr
     bundle = Bundle.from_image(flat if flat.shape[2] > 1 else flat[..., 0])
     mount = Mount(whole.bundle_offsets)
     frames = torch.from_numpy(burst.frames)
-    frames = (mount.steadied(frames) if mount.offsets.any() else frames) - _own_light(whole)
+    frames = mount.steadied(frames) if mount.offsets.any() else frames
+    # Saturated pixels are told by their light, so they keep all of it.
+    frames = torch.where(frames < SATURATED, frames - _own_light(whole), frames)
     take = sample_pixels if case.physics == "mask" else sample_cores
     samples = take(frames.to(find_device(device)), bundle, burst)
     x, y = samples.positions.round().long().cpu().T
