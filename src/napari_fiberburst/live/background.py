@@ -17,17 +17,18 @@ Job = Generator[Any, None, Value]
 class Background(Generic[Value]):
     """Does one job at a time. A job is a generator that returns its result; between its steps it can be stopped.
 
+    Torch uses one thread in it: more would hold up the pictures, and wait for one another where processors are busy,
+    so that frames this small took two of them three times the processors' time of one.
+
     Parameters
     ----------
     waits : bool
         Whether `begin` returns when the job is done, so that what comes of frames does not depend on how long jobs
         take.
-    threads : int or None
-        How many threads torch may use in the job; None for as many as elsewhere. More than one hold up the pictures.
     """
 
-    def __init__(self, *, waits: bool, threads: int | None = 1) -> None:
-        self._waits, self._threads = waits, threads
+    def __init__(self, *, waits: bool) -> None:
+        self._waits = waits
         self._pool: ThreadPoolExecutor | None = None
         self._job: Future[Value | None] | None = None
         self._stop = threading.Event()
@@ -46,7 +47,7 @@ class Background(Generic[Value]):
             self._job.set_result(drain(job))
             return
         if self._pool is None:
-            self._pool = _pool_of_one(self._threads)
+            self._pool = _pool_of_one()
         self._job = self._pool.submit(_done, job, self._stop)
 
     def taken(self) -> Value | None:
@@ -81,11 +82,10 @@ def _done(job: Job[Value], stop: threading.Event) -> Value | None:
     return None
 
 
-def _pool_of_one(threads_there: int | None) -> ThreadPoolExecutor:
-    """Return a thread in which torch uses so many others, and as many as before elsewhere."""
+def _pool_of_one() -> ThreadPoolExecutor:
+    """Return a thread in which torch uses no others, and as many as before elsewhere."""
     threads = torch.get_num_threads()
-    there = threads if threads_there is None else threads_there
-    pool = ThreadPoolExecutor(1, "beside live view", initializer=torch.set_num_threads, initargs=(there,))
+    pool = ThreadPoolExecutor(1, "beside live view", initializer=torch.set_num_threads, initargs=(1,))
     pool.submit(int).result()
     torch.set_num_threads(threads)  # torch takes the last number that was set for all threads to come, too
     return pool

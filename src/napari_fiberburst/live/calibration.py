@@ -57,8 +57,7 @@ class Calibration:
         self._levels = black_level, white_level
         self._frames: list[NDArray[Any]] = []
         self._since = 0.0
-        # There are no pictures yet that threads could hold up.
-        self._background: Background[Bundle | None] = Background(waits=waits, threads=None)
+        self._background: Background[Bundle | None] = Background(waits=waits)
         self._pitch: float | None = None
         self._has_looked = False
 

@@ -27,7 +27,7 @@ _SPACING, _SMOOTHNESS = 0.3, 0.03
 _ROUNDS = 3
 # Offsets are taken out from this part of the mean light on (standard deviation), because smaller ones cost less than
 # their errors do; and where they stand out of chance by so many standard errors.
-_LEAST_OFFSET, _LEAST_SCORE = 0.05, 6.0
+_LEAST_OFFSET, _LEAST_SCORE = 0.03, 6.0
 # Frames that tell an offset, at least.
 _LEAST_FRAMES = 6
 # A line tells an offset where it has this part of the median core's information.
