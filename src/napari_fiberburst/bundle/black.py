@@ -16,7 +16,7 @@ from napari_fiberburst.operators.filters import local_mean
 _ABOUT, _NEIGHBOURHOOD = 0.7, 3.0
 # This part of the lit pixels, the darkest beside those about them, lies between cores; so many of them tell, in so
 # many frames, spread over all.
-_BETWEEN, _MOST_PIXELS, _MOST_FRAMES = 0.05, 4000, 12
+_BETWEEN, _MOST_PIXELS, _MOST_FRAMES = 0.05, 4000, 6
 # Places with less than this part of a bright place's light are not lit.
 _LIT = 0.1
 # Residuals beyond so many of their median count less (Huber), in so many rounds.
@@ -43,8 +43,8 @@ def black_between_cores(frames: Tensor, pitch: float, field: Tensor) -> float | 
     lit = (field & (about > _LIT * about.max())).nonzero()
     y, x = lit.unbind(dim=1)
     relative = (mean[y, x] / about[y, x]).cpu().numpy()
-    between = np.argsort(relative, kind="stable")[: max(1, int(_BETWEEN * len(relative)))]
-    between = np.sort(between)[:: max(1, len(between) // _MOST_PIXELS)]
+    between = np.flatnonzero(relative <= np.quantile(relative, _BETWEEN))
+    between = between[:: max(1, len(between) // _MOST_PIXELS)]
     y, x = (part.cpu()[torch.from_numpy(between)].to(frames.device) for part in (y, x))
     light, nearby = [], []
     for number in chosen.tolist():
