@@ -126,6 +126,7 @@ def test_a_duplicated_frame_does_no_harm(cores, fitted):
 
     result = reconstruct(recorded(cores, double), fill=True)
     assert result.frames_used == tuple(number for number in range(12) if number != 5)
+    np.testing.assert_array_equal(result.homographies[4], result.homographies[5])
     assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.0
 
 

@@ -30,16 +30,24 @@ def test_copies_change_nothing(noisy, order):
     first = {frame: number for number, frame in reversed(list(enumerate(order)))}
     assert result.frames_used == tuple(sorted(first.values()))
     assert any("copies" in note for note in result.notes)
+    for number, frame in enumerate(order):
+        np.testing.assert_allclose(result.homographies[number], result.homographies[first[frame]], atol=1e-12)
+    np.testing.assert_allclose(result.frame(len(order) - 1), result.frame(first[order[-1]]), atol=0.01)
 
 
 def test_a_codec_may_have_changed_a_copy_of_8_bits_by_a_little(rng):
     frames = rng.integers(0, 256, (6, 31, 37)).astype(np.uint8)
     frames = frames[[0, 1, 1, 2, 3, 4]]
     frames[2, :4] ^= 1
-    assert find_repeated(Burst(frames)).tolist() == [False, False, True, False, False, False]
-    assert not find_repeated(Burst(frames.astype(np.uint16))).any()
+    assert find_repeated(Burst(frames)).tolist() == [[2, 1]]
+    assert not len(find_repeated(Burst(frames.astype(np.uint16))))
 
 
 def test_an_object_that_never_moves_is_no_copy():
     still = np.repeat(np.random.default_rng(0).integers(0, 256, (1, 31, 37)), 5, axis=0).astype(np.uint8)
-    assert not find_repeated(Burst(still)).any()
+    assert not len(find_repeated(Burst(still)))
+
+
+def test_a_copy_of_a_copy_lies_where_the_first_lies(rng):
+    frames = rng.integers(0, 65536, (4, 31, 37)).astype(np.uint16)[[0, 1, 1, 1, 2, 0, 3]]
+    assert find_repeated(Burst(frames)).tolist() == [[2, 1], [3, 1], [5, 0]]

@@ -86,6 +86,8 @@ class Registration(Stored):
         Degrees of freedom of each frame's transform: 0, 2 (translation), 4 (similarity), 6 (affine), 8 (homography).
     left_out : tuple of int
         Frames that were registered, and take no part because a user has left them out.
+    copies : numpy.ndarray or None
+        (K, 2) int64, frames that repeat another one, and that one: they lie where it lies, and take no part.
     """
 
     _kind: ClassVar[str] = "registration"
@@ -108,6 +110,7 @@ class Registration(Stored):
     displacement: Displacement | None = field(default=None, repr=False)
     dof: int = 8
     left_out: tuple[int, ...] = ()
+    copies: NDArray[np.int64] | None = None
 
     @classmethod
     def known(cls, scene_from_frame: NDArray[np.float64], shape: tuple[int, int], cores: int) -> "Registration":
@@ -126,10 +129,24 @@ class Registration(Stored):
 
     @property
     def registered(self) -> NDArray[np.bool_]:
-        """(T,) bool, frames whose place is known: those that take part, and those that a user has left out."""
+        """(T,) bool, frames whose place is known: that take part, that a user has left out, and copies of these."""
         registered = self.used.copy()
         registered[list(self.left_out)] = True
+        if self.copies is not None:
+            registered[self.copies[:, 0]] = registered[self.copies[:, 1]]
         return registered
+
+    def with_copies(self, copies: NDArray[np.int64]) -> "Registration":
+        """Return the registration with frames where those lie that they repeat; copies are (K, 2) as the attribute."""
+        copy, original = copies.T
+        matrices, exposures = self.scene_from_frame.copy(), self.exposures.copy()
+        matrices[copy], exposures[copy] = matrices[original], exposures[original]
+        displacement = self.displacement
+        if displacement is not None:
+            control = displacement.control.clone()
+            control[torch.from_numpy(copy)] = control[torch.from_numpy(original)]
+            displacement = Displacement(displacement.grid, control)
+        return replace(self, scene_from_frame=matrices, exposures=exposures, displacement=displacement, copies=copies)
 
     @property
     def reference(self) -> int:

@@ -12,21 +12,25 @@ from napari_fiberburst.data.burst import Burst
 from napari_fiberburst.io.doubled import are_doubled
 
 
-def find_repeated(burst: Burst) -> NDArray[np.bool_]:
-    """Return which frames (T,) have the pixels of one before them, or in 8 bits nearly those of the one just before.
+def find_repeated(burst: Burst) -> NDArray[np.int64]:
+    """Return frames that repeat another one, and that one, (K, 2): the first of those that are alike.
 
-    None of them where fewer than two frames would be left: an object that never moves is no fault of the recorder.
+    Their pixels are those of one before them, or in 8 bits nearly those of the one just before. None where fewer than
+    two frames would be left: an object that never moves is no fault of the recorder.
     """
-    seen: set[bytes] = set()
-    is_copy = np.zeros(len(burst.frames), dtype=bool)
+    first: dict[bytes, int] = {}
+    original = np.arange(len(burst.frames))
     differences = np.zeros(len(burst.frames))
     levels = burst.white_level - burst.black_level
     for number, frame in enumerate(burst.frames):
-        digest = blake2b(frame).digest()
-        is_copy[number] = digest in seen
-        seen.add(digest)
-        if number > 0 and not is_copy[number]:
+        original[number] = first.setdefault(blake2b(frame).digest(), number)
+        if number > 0 and original[number] == number:
             change = np.sqrt(np.mean(np.square(frame - burst.frames[number - 1])))
             differences[number] = max(levels * float(change), np.finfo(float).tiny)
-    is_copy |= are_doubled(differences, burst.dtype)
-    return is_copy if (~is_copy).sum() >= 2 else np.zeros_like(is_copy)
+    for number in np.flatnonzero(are_doubled(differences, burst.dtype)).tolist():
+        if original[number] == number:
+            original[number] = original[number - 1]
+    copies = np.flatnonzero(original != np.arange(len(original)))
+    if len(original) - len(copies) < 2:
+        copies = copies[:0]
+    return np.stack([copies, original[copies]], axis=1)

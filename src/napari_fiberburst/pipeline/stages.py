@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
@@ -97,7 +98,8 @@ class Stages:
             )
         self._burst, self._method, self._seed, self._given, self._limit = burst, method, seed, given, limit
         self._scenes = Scenes(burst.acquisition, method, seed)
-        self._recorded = _without_copies(burst).to(device)
+        self._copies = find_repeated(burst)
+        self._recorded = _without(self._copies, burst).to(device)
         self._frames = self._recorded
         self._grey = in_grey(self._frames)
         self._marks = find_marks(only_exposed(self._grey))
@@ -117,6 +119,8 @@ class Stages:
         if self._method.flatten == "motion":
             fitted = self._flattened(fitted)
             yield fitted
+        if len(self._copies):
+            fitted = replace(fitted, registration=fitted.registration.with_copies(self._copies))
         return fitted if self._given is None else _compared(fitted, before)
 
     def _align_by(self, mount: Mount | None) -> Generator[Fitted | None, None, Fitted]:
@@ -455,10 +459,10 @@ def _warned(text: str) -> str:
     return text
 
 
-def _without_copies(burst: Burst) -> Tensor:
+def _without(copies: NDArray[np.int64], burst: Burst) -> Tensor:
     """Return the frames (T, H, W, C), black where they repeat another one, so that they count as those do."""
-    frames, repeated = torch.from_numpy(burst.frames), find_repeated(burst)
-    if repeated.any():
+    frames = torch.from_numpy(burst.frames)
+    if len(copies):
         frames = frames.clone()
-        frames[torch.from_numpy(repeated)] = 0
+        frames[torch.from_numpy(copies[:, 0])] = 0
     return frames

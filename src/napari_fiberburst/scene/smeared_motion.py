@@ -118,4 +118,5 @@ def _changed(registration: Registration, changes: NDArray[np.float64]) -> Regist
     reference, known = registration.reference, registration.registered
     relative = np.linalg.inv(changes[reference]) @ changes @ registration.reference_from_frame
     moved = registration.scene_from_frame[reference] @ relative
-    return replace(registration, scene_from_frame=np.where(known[:, None, None], moved, registration.scene_from_frame))
+    found = replace(registration, scene_from_frame=np.where(known[:, None, None], moved, registration.scene_from_frame))
+    return found if found.copies is None else found.with_copies(found.copies)
