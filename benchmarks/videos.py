@@ -2,8 +2,10 @@
 
     python -m benchmarks.videos
     python -m benchmarks.videos --side 256 --frames 120 --seeds 1 2
+    python -m benchmarks.videos --frames 240 --workers 2        # in processes beside this one, which are there before
 
-A hand-held recording with cells that flash for three frames becomes a video of windows of 15 frames, in this process.
+A hand-held recording with cells that flash for three frames becomes a video of windows of 15 frames, in this process or
+on workers.
 Beside the truth of single frames stand the video's frames and what `reconstruct` makes of the same 15 frames, drawn as
 the middle one sees them, after one gain and offset, where both are known, a rim of two pitches left out. Both have the
 bundle as a burst of the recording calibrates it. Times are per frame, all of the video's work but that calibration in
@@ -23,6 +25,7 @@ from numpy.typing import NDArray
 from napari_fiberburst import open_recording, reconstruct, video
 from napari_fiberburst.io.video_writer import write_video
 from napari_fiberburst.quality import psnr
+from napari_fiberburst.recordings.cluster import workers
 from napari_fiberburst.simulation import SimulatedRecording, simulate_recording
 
 WINDOW, STEP, PITCH = 15, 2.5, 4.7
@@ -37,6 +40,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--cells", type=int, default=12, help="that flash for three frames")
+    parser.add_argument("--workers", type=int, help="processes that work; by default this one does")
     options = parser.parse_args()
     print("| seed | video | `reconstruct` | worst frame | ms a frame | a window by `reconstruct` | light kept |")
     print("|---|---|---|---|---|---|---|")
@@ -58,9 +62,10 @@ def row(seed: int, options: Any) -> str:
     with tempfile.TemporaryDirectory() as folder:
         source = open_recording(write_video(recording.source, Path(folder, "clip.mkv")))
         bundle = reconstruct(source.burst(range(2 * WINDOW))).bundle
-        began = time.perf_counter()
-        made = video(source, Path(folder, "clean.ome.zarr"), window=WINDOW, bundle=bundle)
-        a_frame = (time.perf_counter() - began) / len(source)
+        with workers(options.workers, None, source.shape) as client:
+            began = time.perf_counter()
+            made = video(source, Path(folder, "clean.ome.zarr"), window=WINDOW, bundle=bundle, client=client)
+            a_frame = (time.perf_counter() - began) / len(source)
         frames = np.asarray(zarr.open_array(made.path / "0", mode="r"), np.float32)
     spread = np.linspace(WINDOW, len(source) - 1 - WINDOW, LOOKED_AT).round().astype(int).tolist()
     ours: list[float] = []
