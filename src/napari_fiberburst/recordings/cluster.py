@@ -21,6 +21,8 @@ _SAME = ("napari_fiberburst", "distributed", "torch", "numpy", "scipy", "zarr")
 _FIXED, _PER_FRAME_BYTE, _TOGETHER, _PER_NODE = 1100 * 2**20, 5, 2**26, 250
 # There is at most one core to so many pixels, because cores nearer than three pixels are not told apart.
 _PIXELS_PER_CORE = 8
+# Bytes that glibc keeps at the end of its heap, and from which on it asks the system for a piece: its own upper limits.
+_KEPT_BY_MALLOC = {"MALLOC_TRIM_THRESHOLD_": 2**26, "MALLOC_MMAP_THRESHOLD_": 2**25}
 
 
 def unit_memory(shape: tuple[int, int, int, int]) -> int:
@@ -93,7 +95,9 @@ def _started(count: int, need: int) -> Iterator[Any]:
             f"{max(1, MEMORY_LIMIT // need)}"
         )
     # What a worker holds, such as traces, can be read again from where it lies; a copy on the disk would be a third.
-    kept = {"distributed.worker.memory.target": False, "distributed.worker.memory.spill": False}
+    kept: dict[str, Any] = {"distributed.worker.memory.target": False, "distributed.worker.memory.spill": False}
+    # Dask lets workers give freed memory back at once; torch asks for the same megabytes again in its next operation.
+    kept |= {f"distributed.nanny.pre-spawn-environ.{name}": size for name, size in _KEPT_BY_MALLOC.items()}
     with dask.config.set(kept), ExitStack() as opened:
         try:
             cluster = LocalCluster(  # type: ignore[no-untyped-call]
