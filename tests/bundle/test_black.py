@@ -35,7 +35,7 @@ def test_light_between_the_cores_is_not_taken_for_black(scene, above, pedestal):
 
 def test_where_all_light_goes_with_that_about_it_the_level_cannot_be_told():
     smooth = blur(torch.rand(6, 61, 67, generator=torch.Generator().manual_seed(0)), 9.0)
-    assert black_between_cores(0.1 + smooth, 5.0, torch.ones(61, 67, dtype=torch.bool)) is None
+    assert black_between_cores(0.1 + smooth, 5.0) is None
 
 
 def test_an_image_in_even_light_of_a_faint_bundle_is_not_black_between_the_cores():

@@ -25,23 +25,20 @@ _ROBUST, _ROUNDS = 2.5, 4
 _MOST_SPREAD = 0.85
 
 
-def black_between_cores(frames: Tensor, pitch: float, field: Tensor) -> float | None:
+def black_between_cores(frames: Tensor, pitch: float) -> float | None:
     """Return the intensity without light in frames (T, H, W), full scale 1; None where they do not tell it.
 
     Parameters
     ----------
     frames : Tensor
-        In [0, 1], of a bundle whose cores are this many pixels apart.
+        In [0, 1], that the bundle fills.
     pitch : float
-        Pixels.
-    field : Tensor
-        (H, W) bool, where they show the bundle.
+        Of its cores, pixels.
     """
     chosen = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
-    mean, weight = frames.mean(dim=0), field.to(frames)
-    about = local_mean(mean, _NEIGHBOURHOOD * pitch, weight)
-    lit = (field & (about > _LIT * about.max())).nonzero()
-    y, x = lit.unbind(dim=1)
+    mean = frames.mean(dim=0)
+    about = local_mean(mean, _NEIGHBOURHOOD * pitch)
+    y, x = (about > _LIT * about.max()).nonzero().unbind(dim=1)
     relative = (mean[y, x] / about[y, x]).cpu().numpy()
     between = np.flatnonzero(relative <= np.quantile(relative, _BETWEEN))
     between = between[:: max(1, len(between) // _MOST_PIXELS)]
@@ -49,7 +46,7 @@ def black_between_cores(frames: Tensor, pitch: float, field: Tensor) -> float | 
     light, nearby = [], []
     for number in chosen.tolist():
         light.append(frames[number, y, x].double().cpu().numpy())
-        nearby.append(local_mean(frames[number], _ABOUT * pitch, weight)[y, x].double().cpu().numpy())
+        nearby.append(local_mean(frames[number], _ABOUT * pitch)[y, x].double().cpu().numpy())
     height, slope = _line(np.concatenate(nearby), np.concatenate(light))
     # The light about a pixel has the level in it, too.
     return height / (1 - slope) if slope < _MOST_SPREAD else None

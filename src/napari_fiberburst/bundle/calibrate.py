@@ -254,7 +254,7 @@ def _black_level(mean: Tensor, pitch: float, field: Tensor, frames: Tensor | Non
         return darkest
     if frames is None:
         return darkest if darkest < _DARK_BESIDE * float(torch.quantile(thinned(mean), 0.95)) else 0.0
-    told = black_between_cores(frames, pitch, field)
+    told = black_between_cores(frames, pitch)
     return 0.0 if told is None else min(max(told, 0.0), darkest)
 
 

@@ -61,7 +61,7 @@ class Mosaic(Outcome):
         One OME-Zarr image a piece, the largest first.
     resolution : float or None
         Pixels, the finest period on which two halves of the frames agree; None where that is not known.
-    poses, track, bundle, gain_weights, notes, quality
+    poses, track, bundle, notes, quality
         As those of `napari_fiberburst.recordings.outcome.Outcome`.
     """
 
@@ -160,7 +160,6 @@ def _made(
         poses=poses,
         track=track,
         bundle=as_seen(located.work.bundle, track),
-        gain_weights=track.gain_weights,
         notes=located.notes,
         quality=located.quality,
     )

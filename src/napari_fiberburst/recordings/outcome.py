@@ -26,8 +26,6 @@ class Outcome:
     bundle : Bundle
         As the frames have shown it: its gains are measured again by all of them, and by every round of refining. It
         can be kept, and a bundle that was given be made better: ``known.updated(outcome)``.
-    gain_weights : numpy.ndarray
-        (N,) float32, how much light the gains rest on, as those of `napari_fiberburst.Reconstruction`.
     notes : tuple of str
         What a user should know.
     quality : str
@@ -37,9 +35,13 @@ class Outcome:
     poses: Path
     track: Track
     bundle: Bundle
-    gain_weights: NDArray[np.float32]
     notes: tuple[str, ...]
     quality: Literal["good", "doubtful"]
+
+    @property
+    def gain_weights(self) -> NDArray[np.float32]:
+        """How much light the gains rest on, (N,), as those of `napari_fiberburst.Reconstruction`."""
+        return self.track.gain_weights
 
     @property
     def gain_ratios(self) -> NDArray[np.float32]:

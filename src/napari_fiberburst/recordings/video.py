@@ -58,7 +58,7 @@ class Video(Outcome):
         The video file to look at; None where none was asked for.
     window : int
         How many frames stand behind each.
-    poses, track, bundle, gain_weights, notes, quality
+    poses, track, bundle, notes, quality
         As those of `napari_fiberburst.recordings.outcome.Outcome`.
     """
 
@@ -216,7 +216,6 @@ def _written(plan: Plan, located: Located, target: Path) -> Video:
         movie=None,
         track=plan.track,
         bundle=as_seen(located.work.bundle, plan.track),
-        gain_weights=plan.track.gain_weights,
         window=plan.window,
         notes=(*located.notes, *_remarks(plan)),
         quality=located.quality,

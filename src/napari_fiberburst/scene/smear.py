@@ -53,6 +53,11 @@ class Smear:
     steps: Tensor
     way: Way = "to next"
 
+    @classmethod
+    def of(cls, part: float, way: Way, points: Tensor, frames: NDArray[np.intp]) -> "Smear":
+        """Return that of frames, numbers in the order they were taken, whose samples lie at points (T, N, 2)."""
+        return cls(part, (_to_next if way == "to next" else _to_both)(points, frames), way)
+
     @property
     def length(self) -> float:
         """How far samples moved in frames that take part, pixels (root mean square)."""
@@ -85,7 +90,7 @@ def find_smear(
         return None
     grey = replace(samples, values=samples.grey[..., None])
     light = filtered.mean(dim=0, keepdim=True)
-    ways = [_going(way, points, frames) for way in get_args(Way)]
+    ways = [Smear.of(_PROBED, way, points, frames) for way in get_args(Way)]
     scores = [_score(grey, points, grid, light, way) for way in ways]
     if max(scores) < _LEAST_SCORE:
         return None
@@ -94,16 +99,6 @@ def find_smear(
     within = _within(window, grey, replace(way, part=_PARTS[-1]).paths(points))
     left = np.array([_left(within, replace(way, part=part).paths(points), window) for part in _PARTS])
     return replace(way, part=_lowest(left)) if left.min() < (1 - _LEAST_GAIN) * left[0] else None
-
-
-def going_on(smear: Smear, points: Tensor, frames: NDArray[np.intp]) -> Smear:
-    """Return the smear of frames that lie elsewhere, and moved in the same way for as long."""
-    return replace(_going(smear.way, points, frames), part=smear.part)
-
-
-def _going(way: Way, points: Tensor, frames: NDArray[np.intp]) -> Smear:
-    steps = (_to_next if way == "to next" else _to_both)(points, frames)
-    return Smear(_PROBED, steps, way)
 
 
 def _to_next(points: Tensor, frames: NDArray[np.intp]) -> Tensor:

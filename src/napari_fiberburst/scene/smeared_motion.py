@@ -19,7 +19,7 @@ from napari_fiberburst.motion.step import MODELS, Seen, stepped
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.grid import Grid
 from napari_fiberburst.scene.gains import measured_gains
-from napari_fiberburst.scene.smear import Smear, going_on
+from napari_fiberburst.scene.smear import Smear
 from napari_fiberburst.scene.spline import assemble
 
 # So many times at most: the first halves the error of the motion, and the second takes off a fifth of the rest.
@@ -59,7 +59,7 @@ def refine_along(
     asked = registration
     for _ in range(_ROUNDS):
         points = asked.points(samples.positions)
-        looks = going_on(smear, points, frames).paths(points)
+        looks = Smear.of(smear.part, smear.way, points, frames).paths(points)
         equations = assemble(grid, grey, looks)
         scene = equations.solve(smoothness, scene, _ITERATIONS)
         filtered = equations.through(scene)
