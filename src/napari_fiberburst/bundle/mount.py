@@ -129,7 +129,7 @@ def find_mount(grey: Tensor) -> Mount | None:
     mean = patterns.spectra[0]
     for number in range(1, len(used)):
         offsets[number] = patterns.searched(number, mean)
-        mean = mean + patterns.moved_back(offsets)[number]
+        mean = mean + patterns.moved_back(offsets[number : number + 1], number)[0]
     for _ in range(_ROUNDS):
         offsets = patterns.refined(patterns.others(offsets), offsets)
     gain = patterns.power(offsets) / patterns.power(torch.zeros_like(offsets))
@@ -186,9 +186,12 @@ class _Patterns:
         frequencies = 2 * math.pi * torch.stack([x[band], y[band]], dim=1)
         return cls(spectra, frequencies, band, (height, width), ring_frequency(pitch))
 
-    def moved_back(self, offsets: Tensor) -> Tensor:
-        """Return the spectra of images whose bundles were `offsets` (T, 2) away, moved to where these are 0."""
-        return steady.complex_product(self.spectra, self._waves(offsets))
+    def moved_back(self, offsets: Tensor, first: int = 0) -> Tensor:
+        """Return the spectra of images from the first on, whose bundles were `offsets` away, moved to where that is 0.
+
+        Offsets are (n, 2), and spectra (n, K).
+        """
+        return steady.complex_product(self.spectra[first : first + len(offsets)], self._waves(offsets))
 
     def others(self, offsets: Tensor) -> Tensor:
         """Return for each image the sum of all others, moved back."""

@@ -69,7 +69,7 @@ def find_shifts(
     pitch : float
         Distance of neighbouring positions, pixels.
     """
-    spacing = max(0.6 * pitch, max(shape) / _MOST_SIDE)
+    spacing = spacing_of(shape, pitch)
     height, width = shape
     grid = Grid.over((0, 0, width - 1, height - 1), spacing)
     images, mask = _images(positions, values, weights, grid, max(0.5, 0.6 * pitch / spacing))
@@ -82,6 +82,11 @@ def find_shifts(
         scores[first, second] = scores[second, first] = score
         pairwise[first, second], pairwise[second, first] = shift, -shift
     return _span(scores, pairwise * spacing)
+
+
+def spacing_of(shape: tuple[int, int], pitch: float) -> float:
+    """Return from node to node of the images in which shifts are looked for, pixels: shifts are that coarse."""
+    return max(0.6 * pitch, max(shape) / _MOST_SIDE)
 
 
 def confidence(

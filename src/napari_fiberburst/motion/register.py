@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.motion import wide
 from napari_fiberburst.motion.coarse import find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.motion.freedom import restrict
@@ -147,7 +148,11 @@ def registering(
     if found.used.sum() < 2:
         return alone(found, samples)
     search = _Search(samples=samples, shifts=moved, noise=noise, iterations=iterations, seed=seed, places=places)
-    found = yield from search.refine(replace(found, stage="coarse"), (COARSE,), None, _COARSE_SAMPLES)
+    found = replace(found, stage="coarse")
+    for spacing, levels in wide.scales(samples.shape, samples.pitch):
+        seen = replace(search, samples=wide.smoothed(samples, spacing))
+        found = yield from seen.refine(found, levels, None, _COARSE_SAMPLES)
+    found = yield from search.refine(found, (COARSE,), None, _COARSE_SAMPLES)
     found = replace(found, stage="fine")
     yield found
     found = yield from search.refine(found, FINER, None, None)

@@ -26,7 +26,8 @@ from napari_fiberburst.recordings.work import Work
 from napari_fiberburst.scene.smoothness import UNTOLD, weighted_median
 from napari_fiberburst.stored import Stored
 
-# Side of the tiles on which frames are compared with the scene, nodes: all of most mosaics.
+# Side of the tiles on which frames are compared with the scene, nodes, at most. They are of one size, because workers
+# would wait for the one that has the largest.
 TILE_SIDE = 896
 # Nodes about a tile, beyond half of a frame, that the scene has to be right in.
 _MARGIN = 16
@@ -116,7 +117,7 @@ def halo_of(shape: tuple[int, int]) -> int:
 
 
 def _tiles(track: Track) -> list[tuple[int, Tile]]:
-    return pieces_tiled(track, TILE_SIDE, halo_of(track.shape))
+    return pieces_tiled(track, TILE_SIDE, halo_of(track.shape), is_even=True)
 
 
 def refine(traces: Traces, track: Track, frames: NDArray[np.int64], grid: Grid, filtered: Tensor) -> Refinement:

@@ -33,8 +33,9 @@ _MOST_PIECES, _APART, _MOST_KEPT = 8, 0.4, 24
 # So many frames before a piece ends and after the next one begins are compared: a probe that was lifted comes down
 # near where it was.
 _ABOUT_A_GAP = 3
-# Pairs to a unit of work.
-_PAIRS = 256
+# Pairs to a unit of work: few enough that workers share them evenly, but not so few that they ask for the same images
+# again.
+_LEAST_PAIRS, _MOST_PAIRS, _EVEN_UNITS = 32, 256, 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,11 +66,24 @@ class Asked(Stored):
         is_tied = (poses.piece[first] == poses.piece[second]) & (poses.piece[first] >= 0)
         return cls(pairs=both, expected=expected(poses, both), is_tied=is_tied)
 
+    @property
+    def units(self) -> range:
+        """The numbers of the units of work that they make."""
+        return range(-(-len(self.pairs) // self._together))
+
+    def unit(self, number: int) -> slice:
+        """Return which pairs a unit has."""
+        return slice(number * self._together, (number + 1) * self._together)
+
+    @property
+    def _together(self) -> int:
+        return min(max(-(-len(self.pairs) // _EVEN_UNITS), _LEAST_PAIRS), _MOST_PAIRS)
+
 
 def link_unit(work: Work, stage: str, number: int) -> None:
     """Link some of the pairs that a stage asks for: where they are expected, or anywhere where nothing is."""
     asked = Asked.load(work.shared(stage))
-    own = slice(number * _PAIRS, (number + 1) * _PAIRS)
+    own = asked.unit(number)
     pairs, is_tied = asked.pairs[own], asked.is_tied[own]
     linker, radius = _linker(work), _DRIFT * min(work.bundle.shape)
     links = linker.follow(_listed(pairs[is_tied]), asked.expected[own][is_tied], radius)
@@ -111,8 +125,9 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
         pairs = [pair for pair in chosen if pair not in tried]
         tried.update(pairs)
         work.begin(stage)
-        Asked.of(pairs, poses).save(work.shared(stage))
-        units = range(-(-len(pairs) // _PAIRS))
+        asked = Asked.of(pairs, poses)
+        asked.save(work.shared(stage))
+        units = asked.units
         for _, left in complete(link_unit, stage, work, units, client):
             yield Doing(f"looking for {name}", number, len(rounds), left, len(units))
         for unit in units:

@@ -49,7 +49,7 @@ class Tile:
         return slice(above, rows - below), slice(left, columns - right)
 
 
-def tiles_over(whole: Grid, side: int, halo: int) -> Iterator[Tile]:
+def tiles_over(whole: Grid, side: int, halo: int, *, is_even: bool = False) -> Iterator[Tile]:
     """Return the tiles of a picture, row by row.
 
     Parameters
@@ -57,14 +57,17 @@ def tiles_over(whole: Grid, side: int, halo: int) -> Iterator[Tile]:
     whole : Grid
         Of the picture.
     side : int
-        Of a tile, nodes.
+        Of a tile, nodes, at most.
     halo : int
         Nodes about each that are solved with it, where there are any.
+    is_even : bool
+        Whether tiles are of one size, rather than all but the last of this side.
     """
     rows, columns = whole.shape
-    for top in range(0, rows, side):
-        for left in range(0, columns, side):
-            bottom, right = min(top + side, rows), min(left + side, columns)
+    height, width = (_even(count, side) if is_even else side for count in whole.shape)
+    for top in range(0, rows, height):
+        for left in range(0, columns, width):
+            bottom, right = min(top + height, rows), min(left + width, columns)
             first_row, first_column = max(0, top - halo), max(0, left - halo)
             last_row, last_column = min(rows, bottom + halo), min(columns, right + halo)
             grid = Grid(
@@ -81,6 +84,11 @@ def tiles_over(whole: Grid, side: int, halo: int) -> Iterator[Tile]:
             )
 
 
+def _even(count: int, most: int) -> int:
+    """Return the side of as few parts of one size as make up a count."""
+    return math.ceil(count / math.ceil(count / most))
+
+
 def picture_of(track: Track, piece: int) -> Grid:
     """Return the nodes of all that a piece's frames see, one to a pixel of its first frame, at whole pixels."""
     x0, y0, x1, y1 = track.bounds(piece)
@@ -88,11 +96,11 @@ def picture_of(track: Track, piece: int) -> Grid:
     return Grid(float(left), float(top), 1.0, (max(2, math.ceil(y1) - top + 1), max(2, math.ceil(x1) - left + 1)))
 
 
-def pieces_tiled(track: Track, side: int, halo: int) -> list[tuple[int, Tile]]:
-    """Return the tiles of all pieces, each with the number of its piece."""
+def pieces_tiled(track: Track, side: int, halo: int, *, is_even: bool = False) -> list[tuple[int, Tile]]:
+    """Return the tiles of all pieces, as `tiles_over` has them, each with the number of its piece."""
     return [
         (piece, tile)
         for piece in range(track.pieces)
         if (track.piece == piece).any()
-        for tile in tiles_over(picture_of(track, piece), side, halo)
+        for tile in tiles_over(picture_of(track, piece), side, halo, is_even=is_even)
     ]
