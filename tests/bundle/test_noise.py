@@ -28,6 +28,12 @@ def test_shot_noise_is_that_of_the_electrons(photons):
     assert noise.shot * photons == pytest.approx(1, abs=0.15)
 
 
+def test_noise_does_not_depend_on_how_many_pixels_there_are():
+    noise, bundle, *_ = measured(3000.0, shape=(483, 521), frames=5)
+    assert (bundle.transmission > 0.3).sum() > 80_000  # of which no more than half are asked
+    assert noise.shot * 3000 == pytest.approx(1, abs=0.15)
+
+
 def test_flicker_and_channels_do_not_pass_for_noise():
     flickering, *_ = measured(3000.0, faults=Faults(flicker=0.2))
     colour, *_ = measured(3000.0, channels=3)

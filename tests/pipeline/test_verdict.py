@@ -132,6 +132,11 @@ def test_each_sign_of_a_fault_is_a_reason_of_its_own():
     assert len(set(reasons)) == len(signs)
 
 
+def test_a_still_pattern_that_only_many_frames_can_show_is_no_reason():
+    assert verdict(frames=300, still=5.0).quality == "good"
+    assert verdict(frames=300, still=40.0).quality == "doubtful"
+
+
 def test_few_frames_may_miss_more_of_what_is_left_out():
     apart = {"disagreement": 0.2}
     assert verdict(frames=6, error=0.3, **apart).quality == "good"

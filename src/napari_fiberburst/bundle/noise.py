@@ -88,8 +88,9 @@ def measure_noise(grey: Tensor, bundle: Bundle, acquisition: Acquisition, sample
     value, left = usable * (value - mean_value), usable * (left - mean_left)
     left = left - value * (value * left).sum(dim=0) / value.square().sum(dim=0).clamp_min(1e-12)
     enough = count >= 3
-    # A core's own noise goes into its value: each pixel has a share of it.
-    power = torch.zeros(len(bundle.centres)).to(light).index_add_(0, labels, known.transmission[y, x] ** 2)
+    # A core's own noise goes into its value: each of its pixels, whether it is asked or not, has a share of it.
+    every, power = known.transmission[known.own], torch.zeros(len(bundle.centres)).to(light)
+    power = power.index_add_(0, known.labels[known.own], every**2)
     own = (1 - known.transmission[y, x] ** 2 / power[labels].clamp_min(1e-9)).clamp_min(0.05)
     square = (left**2).sum(dim=0) / ((count - 2).clamp_min(1) * own)
     brightness = (usable * light).sum(dim=0) / count.clamp_min(1) - known.black
