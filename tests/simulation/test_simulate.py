@@ -81,6 +81,11 @@ def test_masked_frames_are_truth_times_transmission():
     np.testing.assert_allclose(simulated.burst.frames, expected, atol=0.51 / 255)
 
 
+def test_a_scene_that_is_too_large_to_be_drawn_says_what_else_there_is():
+    with pytest.raises(SettingsError, match="4000 x 4100 pixels look at .* a scene of your own"):
+        simulate("tissue", shape=(4000, 4100), frames=1)
+
+
 def test_a_core_shows_the_mean_of_the_scene_over_its_area():
     # A ramp's mean over a disc is its value at the centre.
     columns = np.linspace(0.1, 0.9, 200, dtype=np.float32)

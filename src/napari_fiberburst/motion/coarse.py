@@ -1,8 +1,8 @@
 """Registration without honeycomb: from core samples to the transform of every frame, and how far to trust it.
 
 Coarse, by cross-correlation normalised by the overlap (Padfield, 2012): whitened phase correlation locks on the bundle
-or on noise. The best-connected tree of pairs gives the shifts, so motion may exceed the field as long as some frames
-overlap. Fine, by `napari_fiberburst.motion.joint`.
+or on noise. All pairs that are alike give the shifts, so motion may exceed the field as long as some frames overlap.
+Fine, by `napari_fiberburst.motion.joint`.
 """
 
 from collections.abc import Iterator
@@ -11,6 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from napari_fiberburst.motion.correlation import OverlapCorrelation
@@ -32,6 +35,9 @@ _KEPT = 128
 _NEIGHBOURHOOD, _LEAST_CONTRAST = 4.0, 0.5
 # Images that are this little alike do not show the same thing.
 LEAST_CONFIDENCE = 0.3
+# A pair counts by this power of its correlation, because what is hardly alike is often taken for something else; in so
+# many rounds less, the more it misses beyond so many times the median.
+_CERTAINTY, _ROUNDS, _USUAL = 4, 6, 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,7 +87,7 @@ def find_shifts(
         shift, score = correlation.best(first, second)
         scores[first, second] = scores[second, first] = score
         pairwise[first, second], pairwise[second, first] = shift, -shift
-    return _span(scores, pairwise * spacing)
+    return _placed(scores, pairwise * spacing, spacing)
 
 
 def spacing_of(shape: tuple[int, int], pitch: float) -> float:
@@ -154,21 +160,47 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
                 yield first, second
 
 
-def _span(scores: NDArray[np.float64], pairwise: NDArray[np.float64]) -> CoarseShifts:
-    """Tie frames together along the tree of the best pairs; `pairwise[i, j]` leads from frame j's pixels to i's."""
+def _placed(scores: NDArray[np.float64], pairwise: NDArray[np.float64], spacing: float) -> CoarseShifts:
+    """Place frames where their pairs say; `pairwise[i, j]` leads from frame j's pixels to i's.
+
+    The tree of the best pairs tells which frames belong together. Each of its pairs is off by a part of the spacing,
+    and a tree is a long way round from one end of a burst to the other, so all pairs tell together where frames lie.
+    """
     count = len(scores)
     root = int(np.argmax(np.median(scores, axis=1)))
-    shifts = np.zeros((count, 2))
-    trust = np.zeros(count)
-    connected = np.zeros(count, dtype=bool)
-    connected[root] = True
-    for _ in range(count - 1):
-        open_pairs = np.where(connected[:, None] & ~connected[None, :], scores, -1.0)
-        known, new = np.unravel_index(int(open_pairs.argmax()), open_pairs.shape)
-        if scores[known, new] < LEAST_CONFIDENCE:
-            break
-        shifts[new] = shifts[known] + pairwise[known, new]
-        trust[new] = scores[known, new]
-        connected[new] = True
+    is_alike = scores >= LEAST_CONFIDENCE
+    tree = minimum_spanning_tree(csr_array(np.where(is_alike, 2 - scores, 0)))
+    order, before = breadth_first_order(tree, root, directed=False)
+    connected, trust, shifts = np.zeros(count, dtype=bool), np.zeros(count), np.zeros((count, 2))
+    connected[order] = True
+    for frame in order[1:]:
+        shifts[frame] = shifts[before[frame]] + pairwise[before[frame], frame]
+        trust[frame] = scores[before[frame], frame]
     trust[root] = trust.max()
+    first, second = np.nonzero(np.triu(is_alike & connected & connected[:, None], 1))
+    others = order[1:]
+    if len(others):
+        place = np.full(count, -1)
+        place[others] = np.arange(len(others))
+        lead, certainty = pairwise[first, second], scores[first, second] ** _CERTAINTY
+        weights = certainty
+        for _ in range(_ROUNDS):
+            shifts[others] = _by_pairs(place[first], place[second], lead, weights, len(others))
+            missed = np.hypot(*(shifts[second] - shifts[first] - lead).T)
+            usual = max(spacing, _USUAL * float(np.median(missed)))
+            weights = certainty / (1 + (missed / usual) ** 2) ** 2
     return CoarseShifts(shifts, trust, connected)
+
+
+def _by_pairs(
+    first: NDArray[np.intp], second: NDArray[np.intp], lead: NDArray[np.float64], weights: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Return the shifts (n, 2) that lead best from the first of each pair to its second; the frame -1 lies at 0."""
+    rows = np.arange(len(lead))
+    design = csr_array((len(lead), count))
+    for frames, sign in ((first, -1.0), (second, 1.0)):
+        known = frames >= 0
+        design = design + csr_array((np.full(known.sum(), sign), (rows[known], frames[known])), design.shape)
+    weighted = design.T @ diags_array(weights)
+    solved: NDArray[np.float64] = spsolve((weighted @ design).tocsc(), weighted @ lead).reshape(count, 2)
+    return solved

@@ -73,11 +73,13 @@ class OverlapCorrelation:
         score = (both - sums * sums_second) * scale * scale_second
         if near is not None:
             score = score * self._within(*near).to(score)
-        place = int(score.argmax())
-        shift = [place % self._shape[1], place // self._shape[1]]
-        for axis, side in enumerate(self._shape[::-1]):
-            shift[axis] -= side if shift[axis] > side // 2 else 0
-        return -np.array(shift, dtype=np.float64), max(0.0, float(score.reshape(-1)[place]))
+        row, column = divmod(int(score.argmax()), self._shape[1])
+        shift = np.zeros(2)
+        for axis, (at, along) in enumerate(((column, score[row]), (row, score[:, column]))):
+            side = len(along)
+            about = along[[(at - 1) % side, at, (at + 1) % side]]
+            shift[axis] = at - (side if at > side // 2 else 0) + _summit(*about.tolist())
+        return -shift, max(0.0, float(score[row, column]))
 
     def _within(self, shift: NDArray[np.float64], radius: float) -> Tensor:
         """Return which shifts are so near to one, in the order of the correlation."""
@@ -157,6 +159,17 @@ class _Image:
     area: float
     power: float
     spectra: dict[_Part, Tensor]
+
+
+def _summit(before: float, at: float, after: float) -> float:
+    """Return where the parabola through three neighbours has its top, from the middle one, which is the highest.
+
+    Where one of them is a shift that leaves too little in common, which is 0, the middle one is taken.
+    """
+    curvature = before - 2 * at + after
+    if min(before, after) <= 0 or not curvature < 0:
+        return 0.0
+    return (before - after) / (2 * curvature)
 
 
 def _reversed(image: Tensor) -> Tensor:

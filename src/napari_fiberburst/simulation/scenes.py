@@ -223,6 +223,11 @@ def _blank(shape: tuple[int, int], value: float, reach: Reach | None) -> tuple[N
     left, above, right, below = reach or (margin_x, margin_y, margin_x, margin_y)
     padded = (shape[0] + above + below, shape[1] + left + right, 1)
     if padded[0] * padded[1] > _MOST_PIXELS:
+        if reach is None:
+            raise SettingsError(
+                f"frames of {shape[0]} x {shape[1]} pixels look at a scene too large to be drawn at once; take smaller "
+                "frames, a photograph, or a scene of your own, which are reflected beyond their edges"
+            )
         raise SettingsError(
             f"the path needs {padded[0]} x {padded[1]} pixels of the scene, too large to be drawn at once; take fewer "
             "frames, smaller steps, or the scene 'slide', which has no end"
