@@ -107,6 +107,20 @@ def test_a_footprint_is_a_disc_of_its_radius():
     assert float(footprint.transfer(torch.zeros(1), torch.zeros(1))) == pytest.approx(1)
 
 
+@pytest.mark.parametrize("radius", [2.7, 40.0])
+def test_a_large_image_is_filtered_in_parts_without_seams(radius):
+    shape, margin = (1801, 1147), 60
+    images = torch.randn(2, *shape, generator=torch.Generator().manual_seed(0))
+    device = torch.device("cpu")
+    filtered = Footprint(Grid(0.0, 0.0, 1.3, shape), radius, device)(images)
+    for top in range(0, shape[0], 601):  # parts that are small enough to be filtered whole
+        rows = slice(max(0, top - margin), min(shape[0], top + 601 + margin))
+        part = images[:, rows]
+        whole = Footprint(Grid(0.0, 0.0, 1.3, tuple(part.shape[1:])), radius, device)(part)
+        own = slice(top - rows.start, top - rows.start + min(601, shape[0] - top))
+        torch.testing.assert_close(filtered[:, top : top + 601], whole[:, own], rtol=0, atol=2e-5)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("shape", [(2, 2), (13, 2), (31, 37)])
 def test_reading_is_the_mean_of_four_nodes_by_nearness_up_to_the_edges(shape, dtype):

@@ -13,6 +13,9 @@ from napari_fiberburst.operators.grid import Grid
 # The rim of the disc is this soft, pixels, and drawn with this many points a node.
 _EDGE = 0.3
 _SUBSAMPLES = 5
+# Images of more nodes than the second number are filtered in parts whose transforms have this side: these stay in the
+# processor's cache.
+_SIDE, _LARGE = 360, 2_000_000
 
 
 class Footprint:
@@ -34,8 +37,11 @@ class Footprint:
     def __init__(self, grid: Grid, radius: float, device: torch.device) -> None:
         kernel = disc(radius / grid.spacing, _EDGE / grid.spacing)
         reach = kernel.shape[0] // 2
-        self._shape = grid.shape
-        self._padded = tuple(int(next_fast_len(side + reach, real=True)) for side in grid.shape)
+        self._shape, self._reach = grid.shape, reach
+        self._is_large = grid.shape[0] * grid.shape[1] > _LARGE
+        side = max(_SIDE, int(next_fast_len(8 * reach, real=True)))
+        whole = tuple(int(next_fast_len(side + reach, real=True)) for side in grid.shape)
+        self._padded = (side, side) if self._is_large else whole
         centred = torch.zeros(self._padded)
         centred[: kernel.shape[0], : kernel.shape[1]] = kernel
         centred = torch.roll(centred, (-reach, -reach), (0, 1))
@@ -51,9 +57,21 @@ class Footprint:
 
     def __call__(self, images: Tensor) -> Tensor:
         """Return the filtered images, (..., H, W)."""
-        spectrum = torch.fft.rfft2(images, s=self._padded) * self._response
-        filtered: Tensor = steady.irfft2(spectrum, self._padded)[..., : self._shape[0], : self._shape[1]]
+        if not self._is_large:
+            return self._filtered(images)[..., : self._shape[0], : self._shape[1]]
+        filtered = torch.empty_like(images)
+        own = self._padded[0] - 2 * self._reach
+        about = torch.nn.functional.pad(images, [self._reach] * 4)
+        for top in range(0, self._shape[0], own):
+            for left in range(0, self._shape[1], own):
+                part = self._filtered(about[..., top : top + self._padded[0], left : left + self._padded[1]])
+                into = filtered[..., top : top + own, left : left + own]
+                into.copy_(part[..., self._reach :, self._reach :][..., : into.shape[-2], : into.shape[-1]])
         return filtered
+
+    def _filtered(self, images: Tensor) -> Tensor:
+        """Return images, 0 beyond their edges and up to the size of the transforms, filtered as if they went round."""
+        return steady.irfft2(torch.fft.rfft2(images, s=self._padded).mul_(self._response), self._padded)
 
     def adjoint(self, images: Tensor) -> Tensor:
         """Return the filtered images."""

@@ -50,4 +50,5 @@ def complex_product(first: Tensor, second: Tensor) -> Tensor:
 def irfft2(spectra: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return the images (..., H, W) of spectra, transformed back one by one."""
     images = [torch.fft.irfft2(spectrum, s=shape) for spectrum in spectra.reshape(-1, *spectra.shape[-2:])]
-    return torch.stack(images).reshape(*spectra.shape[:-2], *shape)
+    together = images[0] if len(images) == 1 else torch.stack(images)
+    return together.reshape(*spectra.shape[:-2], *shape)
