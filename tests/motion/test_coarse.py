@@ -36,7 +36,8 @@ def test_one_pair_that_is_wrong_moves_no_frame(positions, look):
     truth = np.tile(np.eye(3), (9, 1, 1))
     truth[:, 0, 2] = 7.0 * np.arange(9)
     values = look(positions, truth)
-    values[4] = look(positions, truth[4:5] + [[0, 0, 400.0], [0, 0, 300.0], [0, 0, 0]])[0]  # another place
+    elsewhere = np.array([[0, 0, 400.0], [0, 0, 300.0], [0, 0, 0]])
+    values[4] = look(positions, truth[4:5] + elsewhere)[0]
     found = find_shifts(positions, values, torch.ones_like(values), SHAPE, PITCH)
     others = np.delete(np.arange(9), 4)
     missed = found.shifts - truth[:, :2, 2]

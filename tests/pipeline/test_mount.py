@@ -25,7 +25,7 @@ def followed(shifted):
 
 def test_a_bundle_that_moves_costs_little(shifted, followed, cores, fitted):
     # Frames that are moved back are interpolated, which takes some of their finest detail.
-    assert psnr(followed.image, shifted.truth[0]) > psnr(fitted.image, cores.truth[0]) - 0.8
+    assert psnr(followed.image, shifted.truth[0]) > psnr(fitted.image, cores.truth[0]) - 0.9
     assert any("the bundle moves on the camera" in note for note in followed.notes)
     assert not any("the bundle moves on the camera" in note for note in fitted.notes)
 

@@ -91,7 +91,9 @@ def test_what_is_masked_has_no_part(world, rng):
     found, score = correlation(marked, [circle, circle]).best(0, 1)
     np.testing.assert_allclose(found, [6, -4], atol=NEAR)
     assert score == pytest.approx(clean[1], rel=1e-3)
-    np.testing.assert_allclose(correlation(marked).best(0, 1)[0], [0, 0], atol=NEAR)  # without the masks, the mark stands still
+    np.testing.assert_allclose(
+        correlation(marked).best(0, 1)[0], [0, 0], atol=NEAR
+    )  # without the masks, the mark stands still
 
 
 def test_masks_that_differ(world):

@@ -82,7 +82,7 @@ def test_masked_frames_are_truth_times_transmission():
 
 
 def test_a_scene_that_is_too_large_to_be_drawn_says_what_else_there_is():
-    with pytest.raises(SettingsError, match="4000 x 4100 pixels look at .* a scene of your own"):
+    with pytest.raises(SettingsError, match=r"4000 x 4100 pixels look at .* a scene of your own"):
         simulate("tissue", shape=(4000, 4100), frames=1)
 
 

@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from napari_fiberburst.motion.correlation import OverlapCorrelation
+from napari_fiberburst.motion.correlation import CHANCE, OverlapCorrelation
 from napari_fiberburst.motion.models import FrameMotion
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
@@ -33,8 +33,8 @@ _KEPT = 128
 # Brightness and contrast of the images are evened out over so many of their pixels (sigma of a Gaussian), contrast
 # where it is more than this part of the usual one.
 _NEIGHBOURHOOD, _LEAST_CONTRAST = 4.0, 0.5
-# Images that are this little alike do not show the same thing.
-LEAST_CONFIDENCE = 0.3
+# Images that are this little alike do not show the same thing, or less than they may be by chance, up to the second.
+LEAST_CONFIDENCE, _MOST_BY_CHANCE = 0.3, 0.5
 # A pair counts by this power of its correlation, because what is hardly alike is often taken for something else; in so
 # many rounds less, the more it misses beyond so many times the median.
 _CERTAINTY, _ROUNDS, _USUAL = 4, 6, 2.0
@@ -87,7 +87,10 @@ def find_shifts(
         shift, score = correlation.best(first, second)
         scores[first, second] = scores[second, first] = score
         pairwise[first, second], pairwise[second, first] = shift, -shift
-    return _placed(scores, pairwise * spacing, spacing)
+    pairwise *= spacing
+    in_common = np.prod(np.clip(1 - np.abs(pairwise) / (width, height), 0, 1), axis=2) * len(positions)
+    by_chance = CHANCE / np.sqrt(np.maximum(in_common, 1))
+    return _placed(scores, scores >= np.clip(by_chance, LEAST_CONFIDENCE, _MOST_BY_CHANCE), pairwise, spacing)
 
 
 def spacing_of(shape: tuple[int, int], pitch: float) -> float:
@@ -160,15 +163,16 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
                 yield first, second
 
 
-def _placed(scores: NDArray[np.float64], pairwise: NDArray[np.float64], spacing: float) -> CoarseShifts:
-    """Place frames where their pairs say; `pairwise[i, j]` leads from frame j's pixels to i's.
+def _placed(
+    scores: NDArray[np.float64], is_alike: NDArray[np.bool_], pairwise: NDArray[np.float64], spacing: float
+) -> CoarseShifts:
+    """Place frames where pairs that are alike say; `pairwise[i, j]` leads from frame j's pixels to i's.
 
     The tree of the best pairs tells which frames belong together. Each of its pairs is off by a part of the spacing,
     and a tree is a long way round from one end of a burst to the other, so all pairs tell together where frames lie.
     """
     count = len(scores)
     root = int(np.argmax(np.median(scores, axis=1)))
-    is_alike = scores >= LEAST_CONFIDENCE
     tree = minimum_spanning_tree(csr_array(np.where(is_alike, 2 - scores, 0)))
     order, before = breadth_first_order(tree, root, directed=False)
     connected, trust, shifts = np.zeros(count, dtype=bool), np.zeros(count), np.zeros((count, 2))
@@ -193,7 +197,11 @@ def _placed(scores: NDArray[np.float64], pairwise: NDArray[np.float64], spacing:
 
 
 def _by_pairs(
-    first: NDArray[np.intp], second: NDArray[np.intp], lead: NDArray[np.float64], weights: NDArray[np.float64], count: int
+    first: NDArray[np.intp],
+    second: NDArray[np.intp],
+    lead: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    count: int,
 ) -> NDArray[np.float64]:
     """Return the shifts (n, 2) that lead best from the first of each pair to its second; the frame -1 lies at 0."""
     rows = np.arange(len(lead))

@@ -20,6 +20,8 @@ from napari_fiberburst.operators import steady
 
 # Pairs need this much of the field in common; less is by chance too often alike.
 LEAST_OVERLAP = 0.12
+# Of N cores in common the best shift is alike by this over the root of N where nothing is the same.
+CHANCE = 6.0
 # Flat patches correlate by noise: a share of the whole image's power steadies the norm.
 _STEADYING = 0.02
 

@@ -102,7 +102,7 @@ def glance(burst: Burst) -> Glance:
     --------
     >>> from napari_fiberburst.simulation import simulate
     >>> glance(simulate("cat", shape=(96, 110), frames=6, pitch=6.0).burst).words
-    'cores 6.0 px apart · moves by 3.0 cores'
+    'cores 6.0 px apart · moves by 3.3 cores'
     """
     numbers, rows, columns = some_of(*burst.shape[:3])
     seen = burst.crop(rows, columns)

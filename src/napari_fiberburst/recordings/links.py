@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from napari_fiberburst.motion.correlation import OverlapCorrelation
+from napari_fiberburst.motion.correlation import CHANCE, OverlapCorrelation
 from napari_fiberburst.recordings import rows
 from napari_fiberburst.recordings.views import Views
 from napari_fiberburst.stored import Stored
@@ -22,8 +22,6 @@ _TOGETHER, _STRIDE, _STEPS = 32, 2, 5
 _ROBUST = 3.0
 # Pairs that are refined from where they are expected are not looked for elsewhere if they are so much alike there.
 _SURELY_ALIKE = 0.6
-# Of N cores in common the best shift is alike by this over the root of N where nothing is the same.
-_CHANCE = 6.0
 # A pair that has to turn (radians) or to grow by more than this, beyond what is expected, was not found.
 _MOST_TURN = 0.15
 # Where a mask that is interpolated is at least this, it is whole.
@@ -152,7 +150,7 @@ class Linker:
     def _by_chance(self, links: Links) -> NDArray[np.float64]:
         """Return how alike what each pair has in common may be by chance, (L,): the fewer cores, the more."""
         cores = 12 * links.reach.prod(axis=1) / self._views.pitch**2  # an even square has its side over root 12 as rms
-        alike: NDArray[np.float64] = _CHANCE / np.sqrt(np.maximum(cores, 1))
+        alike: NDArray[np.float64] = CHANCE / np.sqrt(np.maximum(cores, 1))
         return alike
 
     def _refined(self, pairs: Sequence[Pair], starts: NDArray[np.float64]) -> Links:

@@ -1,0 +1,79 @@
+"""What the first levels of a registration are held to: samples in even light, and wide frames at coarser scales.
+
+Uneven light stands still while the object moves. Where it changes more over the frame than the object does, the first
+iterations would follow it, so its slow changes are taken out of what they see; later ones know the gains.
+
+A shift leaves turns, zoom and perspective, and what these move at a frame's edge grows with its width. Gauss-Newton
+finds its way from about as far as detail is wide, so frames that are many cores wide are first registered by what they
+show of coarser detail, from the scale in which their shifts were found to that of the first level of all frames, each
+scale half of the one before.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from napari_fiberburst.bundle.samples import Samples
+from napari_fiberburst.motion.coarse import spacing_of
+from napari_fiberburst.motion.problem import COARSE, FINER, Level
+from napari_fiberburst.operators import steady
+from napari_fiberburst.operators.filters import filled_mean
+from napari_fiberburst.operators.grid import Grid
+
+# The light is a polynomial of this degree over the frame, in logarithms; darker places than this part of its mean have
+# none.
+_DEGREE, _LEAST_LIGHT = 4, 0.05
+# Pitches from node to node, from which on a scale has levels of its own.
+_LEAST_SPACING = 1.0
+# Of the Gaussian that smooths samples, in nodes.
+_SIGMA = 0.7
+
+
+def in_even_light(samples: Samples) -> Samples:
+    """Return samples without the slow changes over the frame that all frames have alike."""
+    mass = samples.weights.sum(dim=0)
+    light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
+    usual = steady.weighted_mean(light, mass)
+    seen = (mass > 0) & (light > _LEAST_LIGHT * usual)
+    height, width = samples.shape
+    x, y = (
+        (2 * samples.positions / torch.tensor([width, height]).to(samples.positions) - 1).double().cpu().unbind(dim=1)
+    )
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    terms = torch.stack([x**i * y**j for i, j in powers], dim=1)
+    known = seen.cpu()
+    if int(known.sum()) < 2 * len(powers):
+        return samples
+    logs = (light / usual.clamp_min(1e-9)).clamp_min(_LEAST_LIGHT).log().double().cpu()
+    solution = torch.linalg.lstsq(terms[known], logs[known]).solution
+    slow = (terms @ solution).clamp(logs[known].min(), logs[known].max()).exp().to(light)
+    return replace(samples, values=samples.values / slow[:, None], weights=samples.weights * slow.square())
+
+
+def scales(shape: tuple[int, int], pitch: float) -> Iterator[tuple[float, tuple[Level, ...]]]:
+    """Return the scales of frames (height, width) before the first level of all frames, the coarsest first.
+
+    Returns
+    -------
+    iterator of (float, tuple of Level)
+        From node to node, pixels, and the levels. None where frames are not wide.
+    """
+    spacing = spacing_of(shape, pitch) / pitch
+    while spacing > _LEAST_SPACING:
+        yield spacing * pitch, tuple(replace(level, spacing=spacing) for level in (COARSE, FINER[0]))
+        spacing /= 2
+
+
+def smoothed(samples: Samples, spacing: float) -> Samples:
+    """Return samples of what nodes so many pixels apart can show, grey."""
+    height, width = samples.shape
+    grid = Grid.over((0, 0, width - 1, height - 1), spacing)
+    at = grid.at(samples.positions)
+
+    def of_frame(values: Tensor, weights: Tensor) -> Tensor:
+        return at(filled_mean(at.adjoint(values * weights)[None], at.adjoint(weights), _SIGMA)[0])
+
+    values = torch.stack([of_frame(*frame) for frame in zip(samples.grey, samples.weights, strict=True)])
+    return replace(samples, values=values[..., None])
