@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# For processes beside one another: one thread each, and threads that wait let others work.
+SHARING := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
 .PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin soak peers docs docs-images docs-results screenshots clean
@@ -13,7 +15,7 @@ demo: .venv/base
 
 # Tracing napari's own code takes as long as the tests do, so it is not part of `make test`.
 coverage: .venv/dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal --cov=napari_fiberburst
+	$(SHARING) $(BIN)/python -m pytest --numprocesses auto --dist worksteal --cov=napari_fiberburst
 
 gui: .venv/gui
 	$(BIN)/napari --with napari-fiberburst "Fiber burst reconstruction"
@@ -22,8 +24,8 @@ gui: .venv/gui
 # windows are slow at anything else, so the plugin's tests have their own.
 test: .venv/dev
 	@$(BIN)/python tests/preflight.py
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal --ignore tests/plugin
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal tests/plugin
+	$(SHARING) $(BIN)/python -m pytest --numprocesses auto --dist worksteal --ignore tests/plugin
+	$(SHARING) $(BIN)/python -m pytest --numprocesses auto --dist worksteal tests/plugin
 
 lint: .venv/dev
 	$(BIN)/ruff check .

@@ -1,7 +1,7 @@
 """Bursts drawn at random: object, size, bundle, motion, light and faults, for verdicts that no limit was tuned on."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,9 @@ from napari_fiberburst.simulation import Camera, Faults, Scene, SimulatedBurst, 
 FAULTY_EACH, _TWO_FAULTS = 3, 0.2
 _SCENES = ("histology", "tissue", "cat", "usaf", "retina")
 _SHAPES = ((157, 171), (224, 224), (301, 253), (192, 240))
+# How often frames are wide, or many: of objects that have so much to see without reflections.
+_LARGE, _LARGE_SCENES = 0.15, ("tissue", "retina")
+_LARGE_SHAPES, _MANY_FRAMES = ((801, 757), (411, 943)), (80, 150)
 _FRAMES, _PITCHES, _PHOTONS = (6, 12, 20, 30), (3.5, 4.7, 6.0, 8.0), (600.0, 3000.0, 8000.0, 20_000.0)
 # Of a photograph, the part that shows the object.
 _PHOTOGRAPHS: Mapping[str, Callable[[], Any]] = {
@@ -81,7 +84,7 @@ class Drawn:
 
 def unseen(seed: int) -> tuple[Drawn, Iterator[tuple[str, Mapping[str, Any]]]]:
     """Draw a burst, and names and settings of the faults to see it with."""
-    rng = np.random.default_rng(seed)
+    rng, rng_large = np.random.default_rng(seed), np.random.default_rng((seed, 1))
     drawn = Drawn(
         scene=str(rng.choice(_SCENES)),
         place=(rng.uniform(), rng.uniform()),
@@ -93,6 +96,12 @@ def unseen(seed: int) -> tuple[Drawn, Iterator[tuple[str, Mapping[str, Any]]]]:
         photons=float(rng.choice(_PHOTONS)),
         seed=int(rng.integers(10_000)),
     )
+    if rng_large.uniform() < _LARGE:
+        drawn = replace(drawn, scene=str(rng_large.choice(_LARGE_SCENES)))
+        if rng_large.uniform() < 0.5:
+            drawn = replace(drawn, shape=_LARGE_SHAPES[rng_large.integers(len(_LARGE_SHAPES))], frames=12)
+        else:
+            drawn = replace(drawn, frames=int(rng_large.choice(_MANY_FRAMES)))
     return drawn, (_faults(rng, drawn.frames) for _ in range(FAULTY_EACH))
 
 

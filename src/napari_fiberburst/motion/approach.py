@@ -24,7 +24,10 @@ from napari_fiberburst.operators.grid import Grid
 
 # The light is a polynomial of this degree over the frame, in logarithms; darker places than this part of its mean have
 # none.
-_DEGREE, _LEAST_LIGHT = 4, 0.05
+_DEGREE, _LEAST_LIGHT = 2, 0.05
+# It is taken out where it changes over the frame by so many times what samples change from frame to frame: bursts in
+# even light have up to 2.5, which is the object's, and to keep that serves smooth objects best.
+_UNEVEN = 3.0
 # Pitches from node to node, from which on a scale has levels of its own.
 _LEAST_SPACING = 1.0
 # Of the Gaussian that smooths samples, in nodes.
@@ -32,11 +35,13 @@ _SIGMA = 0.7
 
 
 def in_even_light(samples: Samples) -> Samples:
-    """Return samples without the slow changes over the frame that all frames have alike."""
+    """Return samples without the slow changes over the frame that all frames have alike, where they are the light's."""
     mass = samples.weights.sum(dim=0)
     light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
     usual = steady.weighted_mean(light, mass)
     seen = (mass > 0) & (light > _LEAST_LIGHT * usual)
+    changes = (samples.grey / light.clamp_min(1e-9) - 1).square()
+    change = steady.weighted_mean(changes, samples.weights * seen).sqrt()
     height, width = samples.shape
     x, y = (
         (2 * samples.positions / torch.tensor([width, height]).to(samples.positions) - 1).double().cpu().unbind(dim=1)
@@ -48,7 +53,10 @@ def in_even_light(samples: Samples) -> Samples:
         return samples
     logs = (light / usual.clamp_min(1e-9)).clamp_min(_LEAST_LIGHT).log().double().cpu()
     solution = torch.linalg.lstsq(terms[known], logs[known]).solution
-    slow = (terms @ solution).clamp(logs[known].min(), logs[known].max()).exp().to(light)
+    slow_logs = (terms @ solution).clamp(logs[known].min(), logs[known].max())
+    if float(slow_logs[known].std()) < _UNEVEN * float(change):
+        return samples
+    slow = slow_logs.exp().to(light)
     return replace(samples, values=samples.values / slow[:, None], weights=samples.weights * slow.square())
 
 

@@ -6,18 +6,15 @@ Fine, by `napari_fiberburst.motion.joint`.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from napari_fiberburst.motion.correlation import CHANCE, OverlapCorrelation
 from napari_fiberburst.motion.models import FrameMotion
+from napari_fiberburst.motion.pairs import CoarseShifts, placed
 from napari_fiberburst.operators import steady
 from napari_fiberburst.operators.filters import blur
 from napari_fiberburst.operators.grid import Grid
@@ -35,34 +32,22 @@ _KEPT = 128
 _NEIGHBOURHOOD, _LEAST_CONTRAST = 4.0, 0.5
 # Images that are this little alike do not show the same thing, or less than they may be by chance, up to the second.
 LEAST_CONFIDENCE, _MOST_BY_CHANCE = 0.3, 0.5
-# A pair counts by this power of its correlation, because what is hardly alike is often taken for something else; in so
-# many rounds less, the more it misses beyond so many times the median.
-_CERTAINTY, _ROUNDS, _USUAL = 4, 6, 2.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CoarseShifts:
-    """Where each frame lies, by shifts alone.
-
-    Attributes
-    ----------
-    shifts : numpy.ndarray
-        (T, 2) pixels, frame to scene.
-    confidence : numpy.ndarray
-        (T,) correlation, 0 to 1, of the pair that ties a frame to the others.
-    connected : numpy.ndarray
-        (T,) bool, frames that are tied to the best-connected one.
-    """
-
-    shifts: NDArray[np.float64]
-    confidence: NDArray[np.float64]
-    connected: NDArray[np.bool_]
+# Frames that travel less than this, in pitches, or whose pairs miss by more than this part of the travel, may be held
+# by what stands still in them. Of at least so many frames, the mean tells what that is; darker places than this part of
+# its mean tell nothing.
+_SHORT_TRAVEL, _UNCLEAR, _FEWEST, _LEAST_LIGHT = 1.0, 0.08, 4, 0.05
+# Without it, frames that were held travel so many times as far, and their pairs miss by no more than this part of that.
+_FARTHER, _CLEAR = 1.3, 0.12
 
 
 def find_shifts(
     positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], pitch: float
 ) -> CoarseShifts:
     """Find the shift of every frame to within about a pitch.
+
+    What stands still in all frames, such as uneven light or gains, is alike where they are not shifted. Where it may
+    hold them there, because they hardly seem to move or their pairs contradict one another, they are compared once more
+    by how they differ from their mean.
 
     Parameters
     ----------
@@ -75,6 +60,19 @@ def find_shifts(
     pitch : float
         Distance of neighbouring positions, pixels.
     """
+    found = _find(positions, values, weights, shape, pitch)
+    is_clear = found.travel > _SHORT_TRAVEL * pitch and found.missed < _UNCLEAR * found.travel
+    if is_clear or len(values) < _FEWEST:
+        return found
+    mean = (weights * values).sum(dim=0) / weights.sum(dim=0).clamp_min(1e-9)
+    changing = values / mean.clamp_min(_LEAST_LIGHT * float(mean.mean())).clamp_min(1e-9)
+    apart = _find(positions, changing, weights, shape, pitch)
+    is_held = apart.travel > _FARTHER * found.travel and apart.missed < _CLEAR * apart.travel
+    return apart if is_held and apart.connected.sum() >= found.connected.sum() else found
+
+
+def _find(positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], pitch: float) -> CoarseShifts:
+    """Find shifts by what frames show."""
     spacing = spacing_of(shape, pitch)
     height, width = shape
     grid = Grid.over((0, 0, width - 1, height - 1), spacing)
@@ -90,7 +88,7 @@ def find_shifts(
     pairwise *= spacing
     in_common = np.prod(np.clip(1 - np.abs(pairwise) / (width, height), 0, 1), axis=2) * len(positions)
     by_chance = CHANCE / np.sqrt(np.maximum(in_common, 1))
-    return _placed(scores, scores >= np.clip(by_chance, LEAST_CONFIDENCE, _MOST_BY_CHANCE), pairwise, spacing)
+    return placed(scores, scores >= np.clip(by_chance, LEAST_CONFIDENCE, _MOST_BY_CHANCE), pairwise, spacing)
 
 
 def spacing_of(shape: tuple[int, int], pitch: float) -> float:
@@ -161,54 +159,3 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
         for second in range(first + 1, count):
             if count <= _ALL_PAIRS or second - first <= _NEIGHBOURS or first in landmarks or second in landmarks:
                 yield first, second
-
-
-def _placed(
-    scores: NDArray[np.float64], is_alike: NDArray[np.bool_], pairwise: NDArray[np.float64], spacing: float
-) -> CoarseShifts:
-    """Place frames where pairs that are alike say; `pairwise[i, j]` leads from frame j's pixels to i's.
-
-    The tree of the best pairs tells which frames belong together. Each of its pairs is off by a part of the spacing,
-    and a tree is a long way round from one end of a burst to the other, so all pairs tell together where frames lie.
-    """
-    count = len(scores)
-    root = int(np.argmax(np.median(scores, axis=1)))
-    tree = minimum_spanning_tree(csr_array(np.where(is_alike, 2 - scores, 0)))
-    order, before = breadth_first_order(tree, root, directed=False)
-    connected, trust, shifts = np.zeros(count, dtype=bool), np.zeros(count), np.zeros((count, 2))
-    connected[order] = True
-    for frame in order[1:]:
-        shifts[frame] = shifts[before[frame]] + pairwise[before[frame], frame]
-        trust[frame] = scores[before[frame], frame]
-    trust[root] = trust.max()
-    first, second = np.nonzero(np.triu(is_alike & connected & connected[:, None], 1))
-    others = order[1:]
-    if len(others):
-        place = np.full(count, -1)
-        place[others] = np.arange(len(others))
-        lead, certainty = pairwise[first, second], scores[first, second] ** _CERTAINTY
-        weights = certainty
-        for _ in range(_ROUNDS):
-            shifts[others] = _by_pairs(place[first], place[second], lead, weights, len(others))
-            missed = np.hypot(*(shifts[second] - shifts[first] - lead).T)
-            usual = max(spacing, _USUAL * float(np.median(missed)))
-            weights = certainty / (1 + (missed / usual) ** 2) ** 2
-    return CoarseShifts(shifts, trust, connected)
-
-
-def _by_pairs(
-    first: NDArray[np.intp],
-    second: NDArray[np.intp],
-    lead: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    count: int,
-) -> NDArray[np.float64]:
-    """Return the shifts (n, 2) that lead best from the first of each pair to its second; the frame -1 lies at 0."""
-    rows = np.arange(len(lead))
-    design = csr_array((len(lead), count))
-    for frames, sign in ((first, -1.0), (second, 1.0)):
-        known = frames >= 0
-        design = design + csr_array((np.full(known.sum(), sign), (rows[known], frames[known])), design.shape)
-    weighted = design.T @ diags_array(weights)
-    solved: NDArray[np.float64] = spsolve((weighted @ design).tocsc(), weighted @ lead).reshape(count, 2)
-    return solved
