@@ -24,8 +24,8 @@ def bending_score(problem: JointProblem, state: JointState) -> float:
     A score test (Rao, 1948): at each control point of each frame, the square of the slope of the misfit along x and
     y, over the variance that residuals without structure would give it; the mean over all of them. It costs one
     linearisation. Where most frames have little and few have much, these were misplaced, so no more counts than a
-    quarter of the frames have. Simulated bursts of seven kinds that do not bend have 0.2 to 1.3, and displacements of 0.3 to 3
-    pixels (root mean square) 5 to 22.
+    quarter of the frames have. Simulated bursts of seven kinds that do not bend have 0.2 to 1.3, and displacements of
+    0.3 to 3 pixels (root mean square) 5 to 22.
 
     Parameters
     ----------
@@ -47,6 +47,8 @@ def bending_score(problem: JointProblem, state: JointState) -> float:
     information = score.new_empty(score.shape)
     information[:, 0], information[:, 1] = x, y
     known = information > _LEAST_INFORMATION * information[information > 0].median()
+    if not bool(known.any()):
+        return 0.0
     ratio = torch.where(known, score**2 / (information * variance).clamp_min(1e-20), 0.0)
     used = known.any(dim=2).any(dim=1)
     of_frames = ratio[used].sum(dim=(1, 2)) / known[used].sum(dim=(1, 2))
