@@ -1,7 +1,7 @@
 """What the first levels of a registration are held to: samples in even light, and wide frames at coarser scales.
 
 Uneven light stands still while the object moves. Where it changes more over the frame than the object does, the first
-iterations would follow it, so its slow changes are taken out of what they see; later ones know the gains.
+iterations would follow it, so its slow changes are taken out of what they see; later ones begin with them as gains.
 
 A shift leaves turns, zoom and perspective, and what these move at a frame's edge grows with its width. Gauss-Newton
 finds its way from about as far as detail is wide, so frames that are many cores wide are first registered by what they
@@ -34,8 +34,12 @@ _LEAST_SPACING = 1.0
 _SIGMA = 0.7
 
 
-def in_even_light(samples: Samples) -> Samples:
-    """Return samples without the slow changes over the frame that all frames have alike, where they are the light's."""
+def uneven_light(samples: Samples) -> Tensor:
+    """Return the slow changes over the frame that all frames have alike, where they are the light's: as gains (G,).
+
+    They are 1 where the light is even, or may be.
+    """
+    gains = torch.ones(samples.cores).to(samples.values)
     mass = samples.weights.sum(dim=0)
     light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
     usual = steady.weighted_mean(light, mass)
@@ -43,21 +47,19 @@ def in_even_light(samples: Samples) -> Samples:
     changes = (samples.grey / light.clamp_min(1e-9) - 1).square()
     change = steady.weighted_mean(changes, samples.weights * seen).sqrt()
     height, width = samples.shape
-    x, y = (
-        (2 * samples.positions / torch.tensor([width, height]).to(samples.positions) - 1).double().cpu().unbind(dim=1)
-    )
+    places = 2 * samples.positions.double().cpu() / torch.tensor([width, height]) - 1
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    terms = torch.stack([x**i * y**j for i, j in powers], dim=1)
+    terms = torch.stack([places[:, 0] ** i * places[:, 1] ** j for i, j in powers], dim=1)
     known = seen.cpu()
     if int(known.sum()) < 2 * len(powers):
-        return samples
-    logs = (light / usual.clamp_min(1e-9)).clamp_min(_LEAST_LIGHT).log().double().cpu()
-    solution = torch.linalg.lstsq(terms[known], logs[known]).solution
-    slow_logs = (terms @ solution).clamp(logs[known].min(), logs[known].max())
-    if float(slow_logs[known].std()) < _UNEVEN * float(change):
-        return samples
-    slow = slow_logs.exp().to(light)
-    return replace(samples, values=samples.values / slow[:, None], weights=samples.weights * slow.square())
+        return gains
+    logs = (light / usual).clamp_min(_LEAST_LIGHT).log().double().cpu()
+    slow = terms @ torch.linalg.lstsq(terms[known], logs[known]).solution
+    if float(slow[known].std()) < _UNEVEN * float(change):
+        return gains
+    slow = (slow - slow[known].median()).clamp(logs[known].min(), logs[known].max())
+    gains[samples.core_index] = slow.exp().to(gains)
+    return gains
 
 
 def scales(shape: tuple[int, int], pitch: float) -> Iterator[tuple[float, tuple[Level, ...]]]:

@@ -36,8 +36,9 @@ LEAST_CONFIDENCE, _MOST_BY_CHANCE = 0.3, 0.5
 # by what stands still in them. Of at least so many frames, the mean tells what that is; darker places than this part of
 # its mean tell nothing.
 _SHORT_TRAVEL, _UNCLEAR, _FEWEST, _LEAST_LIGHT = 1.0, 0.08, 4, 0.05
-# Without it, frames that were held travel so many times as far, and their pairs miss by no more than this part of that.
-_FARTHER, _CLEAR = 1.3, 0.12
+# Without it, frames that were held travel so many times as far, and their pairs miss by no more than this part of that;
+# of so many pairs to a frame, because fewer cannot contradict one another.
+_FARTHER, _CLEAR, _PAIRS_EACH = 1.3, 0.12, 2
 
 
 def find_shifts(
@@ -67,8 +68,9 @@ def find_shifts(
     mean = (weights * values).sum(dim=0) / weights.sum(dim=0).clamp_min(1e-9)
     changing = values / mean.clamp_min(_LEAST_LIGHT * float(mean.mean())).clamp_min(1e-9)
     apart = _find(positions, changing, weights, shape, pitch)
+    is_told = apart.connected.sum() >= found.connected.sum() and apart.pairs >= _PAIRS_EACH * apart.connected.sum()
     is_held = apart.travel > _FARTHER * found.travel and apart.missed < _CLEAR * apart.travel
-    return apart if is_held and apart.connected.sum() >= found.connected.sum() else found
+    return apart if is_told and is_held else found
 
 
 def _find(positions: Tensor, values: Tensor, weights: Tensor, shape: tuple[int, int], pitch: float) -> CoarseShifts:

@@ -25,6 +25,8 @@ class CoarseShifts:
         (T,) correlation, 0 to 1, of the pair that ties a frame to the others.
     connected : numpy.ndarray
         (T,) bool, frames that are tied to the best-connected one.
+    pairs : int
+        How many pairs of these are alike.
     travel : float
         Root mean square of how far the frames of a pair lie apart, pixels.
     missed : float
@@ -34,6 +36,7 @@ class CoarseShifts:
     shifts: NDArray[np.float64]
     confidence: NDArray[np.float64]
     connected: NDArray[np.bool_]
+    pairs: int
     travel: float
     missed: float
 
@@ -84,6 +87,7 @@ def placed(
         shifts=shifts,
         confidence=trust,
         connected=connected,
+        pairs=len(first),
         travel=float(np.sqrt(np.square(apart).sum(axis=1).mean())) if len(first) else 0.0,
         missed=float(np.median(np.hypot(*(apart - pairwise[first, second]).T))) if len(first) else 0.0,
     )

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from napari_fiberburst.bundle.samples import Samples
-from napari_fiberburst.motion.approach import in_even_light, scales, smoothed
+from napari_fiberburst.motion.approach import scales, smoothed, uneven_light
 from napari_fiberburst.motion.coarse import find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
 from napari_fiberburst.motion.freedom import restrict
@@ -149,12 +149,13 @@ def registering(
         return alone(found, samples)
     search = _Search(samples=samples, shifts=moved, noise=noise, iterations=iterations, seed=seed, places=places)
     found = replace(found, stage="coarse")
-    even = in_even_light(samples)
+    light = uneven_light(samples)
+    even = samples.without_gains(light)
     for spacing, levels in scales(samples.shape, samples.pitch):
         coarser = replace(search, samples=smoothed(even, spacing))
         found = yield from coarser.refine(found, levels, None, _COARSE_SAMPLES)
     found = yield from replace(search, samples=even).refine(found, (COARSE,), None, _COARSE_SAMPLES)
-    found = replace(found, stage="fine", gains=np.ones_like(found.gains))  # those were in even light
+    found = replace(found, stage="fine", gains=light.cpu().numpy())
     yield found
     found = yield from search.refine(found, FINER, None, None)
     if bends or (bends is None and search.asks_to_bend(found)):
