@@ -38,7 +38,7 @@ CASES = {
     "bent": lambda fit: reconstruct(
         small(7, deformation=2.0, deformation_length=30.0), device="cpu", motion="deformable", smoothness=0.01
     ),
-    "left out": lambda fit: reconstruct(small(), device="cpu", leave_out=(0, 2)),
+    "left out": lambda fit: reconstruct(small(), device="cpu", leave_out=(0, 1)),
     "marks": lambda fit: reconstruct(small(7, overlay=True, flicker=0.1, black_frames=1), device="cpu"),
     "no first frame": lambda fit: reconstruct(_dark_at_first(), device="cpu"),
     "one frame": lambda fit: reconstruct(
