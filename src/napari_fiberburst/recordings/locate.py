@@ -106,8 +106,8 @@ def locating(
     bundle, notes = _kept_bundle(source, bundle, folder / "bundle.safetensors")
     work = Work(source=source, bundle=bundle, folder=folder)
     traces = yield from tracing(work, client)
-    links = yield from registering(work, dof, client)
-    track = _first_track(work, traces, solve_poses(links, len(traces), dof))
+    links, poses = yield from registering(work, dof, client)
+    track = _first_track(work, traces, poses)
     track = yield from _refining(work, traces, links, track, is_free=dof is None, client=client)
     doubts = _doubts(traces, track)
     return Located(

@@ -99,8 +99,8 @@ def _listed(pairs: NDArray[np.int64]) -> list[Pair]:
     return [(int(first), int(second)) for first, second in pairs]
 
 
-def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Doing, None, Links]:
-    """Find which frames see the same place, from traces that are there; yields how far that is.
+def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Doing, None, tuple[Links, Poses]]:
+    """Find which frames see the same place, and so where each lies, from traces that are there; yields how far that is.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def registering(work: Work, dof: int | None, client: Any | None) -> Generator[Do
     # Images and spectra are not needed any more: some 300 MB, held by what refers to itself.
     _linker.cache_clear()
     gc.collect()
-    return links
+    return links, poses
 
 
 def _at_gap(frames: NDArray[np.int64], gap: int, poses: Poses) -> list[Pair]:
