@@ -49,6 +49,10 @@ class ControlGrid:
         index = row[:, :, None] * columns + column[:, None, :]
         return index.flatten(1), (along_y[:, :, None] * along_x[:, None, :]).flatten(1)
 
+    def to(self, points: Tensor) -> "_Rows":
+        """Return what takes values at control points to frame points (N, 2), for use once."""
+        return _Rows.of(*self.splines(points))
+
     def at(self, points: Tensor) -> "ControlWeights":
         """Return the operator from values at control points to values at frame points (N, 2)."""
         index, weight = self.splines(points)
@@ -57,9 +61,7 @@ class ControlGrid:
         number = torch.arange(len(points), device=points.device).repeat_interleave(index.shape[1])
         counts = torch.bincount(index.flatten(), minlength=size)
         return ControlWeights(
-            to_points=_Rows(
-                index.flatten(), torch.arange(0, index.numel(), index.shape[1], device=points.device), weight.flatten()
-            ),
+            to_points=_Rows.of(index, weight),
             to_controls=_Rows(number[order], counts.cumsum(0) - counts, weight.flatten()[order]),
         )
 
@@ -95,6 +97,12 @@ class _Rows:
     columns: Tensor
     first: Tensor
     entries: Tensor
+
+    @classmethod
+    def of(cls, columns: Tensor, entries: Tensor) -> "_Rows":
+        """Return a matrix of as many entries in each row, both (R, k)."""
+        first = torch.arange(0, columns.numel(), columns.shape[1], device=columns.device)
+        return cls(columns.flatten(), first, entries.flatten())
 
     def __matmul__(self, values: Tensor) -> Tensor:
         """Return the product with each of values (..., columns): (..., R)."""
@@ -153,9 +161,7 @@ class Displacement:
 
     def at(self, points: Tensor) -> Tensor:
         """Return the displacement of every frame at points (N, 2), (T, N, 2)."""
-        index, weight = self.grid.splines(points)
-        parts = [(frame.to(weight)[:, index] * weight).sum(dim=-1).T for frame in self.control]
-        return torch.stack(parts)
+        return (self.grid.to(points) @ self.control.to(points)).mT
 
     def of_frame(self, number: int) -> "Displacement":
         """Return the displacement of one frame alone."""
