@@ -49,12 +49,14 @@ def uneven_light(samples: Samples) -> Tensor:
     height, width = samples.shape
     places = 2 * samples.positions.double().cpu() / torch.tensor([width, height]) - 1
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    terms = torch.stack([places[:, 0] ** i * places[:, 1] ** j for i, j in powers], dim=1)
+    terms = torch.stack([places[:, 0] ** i * places[:, 1] ** j for i, j in powers])
     known = seen.cpu()
     if int(known.sum()) < 2 * len(powers):
         return gains
     logs = (light / usual).clamp_min(_LEAST_LIGHT).log().double().cpu()
-    slow = terms @ torch.linalg.lstsq(terms[known], logs[known]).solution
+    seen_terms = terms * known
+    normal, rhs = steady.row_sums(seen_terms[:, None] * terms), steady.row_sums(seen_terms * logs)
+    slow = (torch.linalg.solve(normal, rhs)[:, None] * terms).sum(dim=0)
     if float(slow[known].std()) < _UNEVEN * float(change):
         return gains
     slow = (slow - slow[known].median()).clamp(logs[known].min(), logs[known].max())

@@ -49,8 +49,8 @@ class ControlGrid:
         index = row[:, :, None] * columns + column[:, None, :]
         return index.flatten(1), (along_y[:, :, None] * along_x[:, None, :]).flatten(1)
 
-    def to(self, points: Tensor) -> "_Rows":
-        """Return what takes values at control points to frame points (N, 2), for use once."""
+    def rows_at(self, points: Tensor) -> "_Rows":
+        """Return what takes values at control points to values at frame points (N, 2), where no adjoint is needed."""
         return _Rows.of(*self.splines(points))
 
     def at(self, points: Tensor) -> "ControlWeights":
@@ -161,7 +161,7 @@ class Displacement:
 
     def at(self, points: Tensor) -> Tensor:
         """Return the displacement of every frame at points (N, 2), (T, N, 2)."""
-        return (self.grid.to(points) @ self.control.to(points)).mT
+        return (self.grid.rows_at(points) @ self.control.to(points)).mT
 
     def of_frame(self, number: int) -> "Displacement":
         """Return the displacement of one frame alone."""
