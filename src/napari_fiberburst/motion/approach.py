@@ -47,13 +47,13 @@ def uneven_light(samples: Samples) -> Tensor:
     changes = (samples.grey / light.clamp_min(1e-9) - 1).square()
     change = steady.weighted_mean(changes, samples.weights * seen).sqrt()
     height, width = samples.shape
-    places = 2 * samples.positions.double().cpu() / torch.tensor([width, height]) - 1
+    places = 2 * samples.positions.cpu().double() / torch.tensor([width, height]) - 1
     powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
     terms = torch.stack([places[:, 0] ** i * places[:, 1] ** j for i, j in powers])
     known = seen.cpu()
     if int(known.sum()) < 2 * len(powers):
         return gains
-    logs = (light / usual).clamp_min(_LEAST_LIGHT).log().double().cpu()
+    logs = (light / usual).clamp_min(_LEAST_LIGHT).log().cpu().double()
     seen_terms = terms * known
     normal, rhs = steady.row_sums(seen_terms[:, None] * terms), steady.row_sums(seen_terms * logs)
     slow = (torch.linalg.solve(normal, rhs)[:, None] * terms).sum(dim=0)
