@@ -4,10 +4,13 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 
-from napari_fiberburst.device import settle_threads
+from napari_fiberburst import reconstruct
+from napari_fiberburst.device import find_device, settle_threads
+from napari_fiberburst.errors import DeviceError
 
 AFTER_A_FORK = """
 import os, sys, torch
@@ -41,3 +44,12 @@ def test_no_more_threads_than_processors(caplog):
 def test_a_forked_process_makes_the_same_image():
     # Without care torch waits for threads that the fork has not taken along, for ever.
     assert subprocess.run([sys.executable, "-c", AFTER_A_FORK], timeout=240).returncode == 0
+
+
+def test_apples_gpus_are_taken_by_nobody_who_needs_double_precision(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert find_device("auto").type == "cpu"
+    assert find_device("mps", needs_double=False).type == "mps"
+    with pytest.raises(DeviceError, match="no double precision"):
+        reconstruct(np.random.default_rng(0).integers(0, 99, (3, 33, 41), dtype=np.uint8), device="mps")

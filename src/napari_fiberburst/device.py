@@ -13,17 +13,25 @@ logger = logging.getLogger(__name__)
 _NO_MEMORY = ("can't allocate memory", "not enough memory", "MPS backend out of memory")
 
 
-def find_device(name: str) -> torch.device:
-    """Return the device called `name`; "auto" is the fastest kind there is: cuda, then mps, then cpu.
+def find_device(name: str, *, needs_double: bool = True) -> torch.device:
+    """Return the device called `name`; "auto" is cuda where it is, and cpu elsewhere.
+
+    Calibration and registration add many numbers up in double precision, which Apple's GPUs ("mps") do not have;
+    `needs_double` is False for what does without.
 
     Raises
     ------
     DeviceError
-        No such device here; the message lists those there are.
+        No such device here; the message lists those there are. Or it has no double precision.
     """
     here = _available()
     if name == "auto":
-        return torch.device(here[0])
+        return torch.device(next(device for device in here if device != "mps"))
+    if name == "mps" and name in here and needs_double:
+        raise DeviceError(
+            "Apple's GPUs have no double precision, which all but the published method needs; take the device 'cpu', "
+            "or 'auto', which is the same here"
+        )
     if name in here or (name == "cuda" and "cuda:0" in here):
         return torch.device(name)
     raise DeviceError(f"device {name!r} is not on this machine; there are auto, {', '.join(here)}")
@@ -76,7 +84,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def free_memory(name: str) -> int | None:
     """Return how many bytes are free on the device called `name`; None where it uses the machine's own memory."""
-    device = find_device(name)
+    device = find_device(name, needs_double=False)
     return torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else None
 
 

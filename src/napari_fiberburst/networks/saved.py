@@ -52,7 +52,7 @@ def load(path: str | Path, device: str = "auto") -> Reconstruction:
     -----
     Nothing in such a file can be executed, and memory is taken for what the file holds, not for what it claims.
     """
-    place = find_device(device)
+    place = find_device(device, needs_double=False)
     if is_model(Path(path)):
         model = Model.load(path)
         return _readable(path, lambda: _restored(model, place))

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, assert_never
 
+import torch
 from numpy.typing import ArrayLike
 
 from napari_fiberburst.bundle.bundle import Bundle
@@ -72,7 +73,7 @@ def reconstruct(
     iterations : int, optional
         Optimisation steps of a network; rounds of joint refinement of the spline.
     device : str, optional
-        "auto", "cpu", "cuda", "cuda:1", "mps".
+        "auto" (CUDA where it is), "cpu", "cuda", "cuda:1"; "mps", an Apple GPU, for the published method alone.
     seed : int
         The same seed gives the same bits on the same CPU, whatever the number of threads; a network's depend on it.
     bundle : Bundle, array_like or path, optional
@@ -152,7 +153,7 @@ def reconstruct(
             raise SettingsError(f"{name} must be a function; got {called!r}")
     if bundle is not None and calibration is not None:
         raise SettingsError("calibration is short for bundle=Bundle.from_image(calibration); give one of the two")
-    find_device(settings.device)  # before a long read
+    _device_of(settings)  # before a long read
     known = bundle if bundle is not None else calibration
     _check_bundle(settings, known)
     if checkpoint is not None:
@@ -244,7 +245,7 @@ def iterate(
     _check_bundle(settings, bundle)
     if isinstance(settings.method, SplineMethod) and initial is not None:
         raise SettingsError("a spline is solved, so there is nothing to continue; run it anew, or take a network")
-    device = find_device(settings.device)
+    device = _device_of(settings)
     settle_threads()
     if checkpointing is not None:
         check_kept(settings)
@@ -269,6 +270,10 @@ def iterate(
             f"memory ran out ({error}); such a run takes about {needed} beside the burst: crop the burst, take fewer "
             "frames, lower the upsampling, or let other programs end"
         ) from error
+
+
+def _device_of(settings: Settings) -> torch.device:
+    return find_device(settings.device, needs_double=not isinstance(settings.method, PublishedMethod))
 
 
 def _check_bundle(settings: Settings, bundle: object) -> None:

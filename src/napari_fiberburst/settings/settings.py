@@ -35,7 +35,7 @@ class Settings:
 
     method: Method = field(default_factory=SplineMethod)
     seed: int = parameter(0, "Seed of everything random; the same seed gives the same image.", least=0, most=2**31 - 1)
-    device: str = parameter("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes the fastest there is.")
+    device: str = parameter("auto", "Where to compute: auto, cpu, cuda, cuda:1, mps; auto takes cuda where it is.")
     time_budget: float | None = parameter(
         None, "Seconds after which to stop with what there is; None for no limit.", above=0
     )
