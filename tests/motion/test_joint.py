@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.motion.levels import through_levels
 
 from napari_fiberburst.coordinates import relative_to, transform_points
 from napari_fiberburst.motion.coarse import find_shifts
 from napari_fiberburst.motion.displacement import ControlGrid, Displacement
-from napari_fiberburst.motion.joint import enter, iterate, normalise, predict, start
+from napari_fiberburst.motion.joint import enter, iterate, predict, start
 from napari_fiberburst.motion.linearised import linearise
 from napari_fiberburst.motion.models import FrameMotion
-from napari_fiberburst.motion.problem import COARSE, FINER, JointProblem
+from napari_fiberburst.motion.problem import COARSE, JointProblem
 
 SHAPE = (120, 140)
 PITCH = 5.0
@@ -32,13 +33,7 @@ def error(motion, truth):
 
 def registered(problem):
     shifts = find_shifts(problem.positions, problem.values, problem.weights, SHAPE, PITCH).shifts
-    state = start(problem, FrameMotion.of_shifts(shifts, SHAPE))
-    for level in (COARSE, *FINER):
-        state = enter(problem, state, level, None)
-        for number in range(level.iterations):
-            state, _ = iterate(problem, state, level, number)
-        state = normalise(problem, state)
-    return state
+    return through_levels(problem, shifts, SHAPE)
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.15])

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from tests.motion.levels import through_levels
 
-from napari_fiberburst.motion.joint import enter, iterate, normalise, start
-from napari_fiberburst.motion.models import FrameMotion
-from napari_fiberburst.motion.problem import COARSE, FINER, JointProblem
+from napari_fiberburst.motion.problem import JointProblem
 from napari_fiberburst.motion.score import bending_score
 
 SHAPE, PITCH, FRAMES = (120, 140), 5.0, 10
@@ -42,13 +41,7 @@ def score(positions, places, values):
         pitch=PITCH,
         dof=8,
     )
-    state = start(problem, FrameMotion.of_shifts(places, SHAPE))
-    for level in (COARSE, *FINER):
-        state = enter(problem, state, level, None)
-        for number in range(level.iterations):
-            state, _ = iterate(problem, state, level, number)
-        state = normalise(problem, state)
-    return bending_score(problem, state)
+    return bending_score(problem, through_levels(problem, places, SHAPE))
 
 
 def test_frames_ask_to_bend_where_many_of_them_do(positions, places, look):

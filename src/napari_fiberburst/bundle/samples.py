@@ -88,6 +88,11 @@ class Samples(Stored):
         return self.values.mean(dim=2)
 
     @property
+    def mean_light(self) -> Tensor:
+        """What each place shows on average over the frames, grey, (N,); 0 where nothing has weight."""
+        return (self.weights * self.grey).sum(dim=0) / self.weights.sum(dim=0).clamp_min(1e-9)
+
+    @property
     def gains_known(self) -> bool:
         """Whether the gains were measured beforehand, or there are none."""
         return self.gain_variance < GUESSED_GAINS

@@ -149,7 +149,7 @@ def _registered(bundle: Bundle, burst: Burst) -> Generator[object, None, Bundle 
 def by_mean(bundle: Bundle, burst: Burst) -> Bundle:
     """Return a bundle whose gains are guessed: what cores show on average, relative to those about them."""
     samples = sample_cores(in_grey(torch.from_numpy(burst.frames))[..., None], bundle, burst)
-    shown = (samples.weights * samples.grey).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
+    shown = samples.mean_light
     light = shown.numpy().clip(_LEAST_GAIN * float(shown.median()))
     gains = (light / np.median(light[_neighbours(bundle.centres)], axis=1)).clip(_LEAST_GAIN, 1 / _LEAST_GAIN)
     guessed = with_gains(bundle, torch.from_numpy(gains.astype(np.float32)))

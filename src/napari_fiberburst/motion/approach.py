@@ -41,7 +41,7 @@ def uneven_light(samples: Samples) -> Tensor:
     """
     gains = torch.ones(samples.cores).to(samples.values)
     mass = samples.weights.sum(dim=0)
-    light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
+    light = samples.mean_light
     usual = steady.weighted_mean(light, mass)
     seen = (mass > 0) & (light > _LEAST_LIGHT * usual)
     changes = (samples.grey / light.clamp_min(1e-9) - 1).square()

@@ -128,7 +128,7 @@ def _of(burst: Burst) -> Glance:
 def _travel(samples: Samples) -> tuple[float, int]:
     """Return how far the object goes, pixels, and how many frames could not be found in the others."""
     # Relative to their mean, cores differ by the object alone: their gains, which do not move, are in it.
-    mean = (samples.weights * samples.grey).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
+    mean = samples.mean_light
     relative = samples.grey / mean.clamp_min(_DARKEST * float(mean.mean()))
     shifts = find_shifts(samples.positions, relative, samples.weights, samples.shape, samples.pitch)
     tied = shifts.connected & (shifts.confidence >= LEAST_CONFIDENCE)

@@ -179,14 +179,13 @@ def _mean(mass: Tensor, values: Tensor) -> float:
 
 def _change(samples: Samples) -> float:
     """Return the variance of what samples change from frame to frame, full scale 1."""
-    mean = (samples.weights * samples.grey).sum(dim=0) / samples.weights.sum(dim=0).clamp_min(1e-9)
-    return _mean(samples.weights, (samples.grey - mean).square())
+    return _mean(samples.weights, (samples.grey - samples.mean_light).square())
 
 
 def _falloff(samples: Samples) -> float:
     """Return how much brighter the middle of the frame is than the edge of its longer side: by a parabola in logs."""
     mass = samples.weights.sum(dim=0)
-    light = (samples.weights * samples.grey).sum(dim=0) / mass.clamp_min(1e-9)
+    light = samples.mean_light
     seen = (mass > 0) & (light > _DARK * steady.weighted_mean(light, mass))
     height, width = samples.shape
     middle = torch.tensor([width - 1.0, height - 1.0]).to(light) / 2
