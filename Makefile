@@ -7,7 +7,7 @@ BIN := .venv/bin
 SHARING := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive
 PIP := $(BIN)/python -m pip install --quiet --constraint constraints.txt
 
-.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-plugin soak peers docs docs-images docs-results screenshots clean
+.PHONY: demo gui test coverage lint bench bench-quick bench-code bench-memory bench-plugin soak peers docs docs-images docs-results screenshots clean
 
 demo: .venv/base
 	mkdir -p demo
@@ -41,12 +41,15 @@ bench: .venv/bench .venv-peers/made
 bench-quick: .venv/bench
 	$(BIN)/python -m benchmarks --quick --results benchmarks/results-quick --overwrite $(MORE)
 
-# What a change of the code may cost: a step, memory, startup, and whole fits beside an earlier version's.
+# What a change of the code may cost, in under five minutes: a step, startup, and whole fits beside an earlier version's.
 bench-code: .venv/bench
 	$(BIN)/python benchmarks/step.py
-	$(BIN)/python -m benchmarks.memory
 	$(BIN)/python benchmarks/startup.py
 	$(BIN)/python -m benchmarks.speed
+
+# Memory beside its estimate, run by run: a quarter of an hour.
+bench-memory: .venv/bench
+	$(BIN)/python -m benchmarks.memory
 
 # What is promised of files, memory, processes and faults, tried for long; under 15 minutes on two cores.
 soak: .venv/soak

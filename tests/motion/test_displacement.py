@@ -40,6 +40,18 @@ def test_a_displacement_is_scipys_spline():
     torch.testing.assert_close(weights(displacement.control).mT, displacement.at(points), atol=1e-5, rtol=1e-5)
 
 
+def test_many_points_are_displaced_as_few_are():
+    displacement = bent(1.0)
+    rows, columns = displacement.grid.nodes.shape
+    generator = torch.Generator().manual_seed(4)
+    points = torch.rand(rows * columns + 1, 2, generator=generator) * torch.tensor([103.0, 81.0]) - 10
+    few = torch.cat([displacement.at(part) for part in points.split(1000)], dim=1)
+    assert float((displacement.at(points) - few).abs().max()) < 0.005
+    corners = torch.tensor([[0.0, 0.0], [82.0, 60.0], [500.0, -9.0]])
+    many = displacement.at(torch.cat([points, corners]))[:, -3:]
+    torch.testing.assert_close(many, displacement.at(corners), atol=1e-3, rtol=0)
+
+
 @pytest.mark.parametrize("reference", [0, 2])
 def test_the_reference_frame_is_where_it_was(reference):
     matrices = torch.eye(3, dtype=torch.float64).repeat(3, 1, 1)

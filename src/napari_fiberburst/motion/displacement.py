@@ -12,6 +12,12 @@ import torch
 from scipy.ndimage import shift
 from torch import Tensor
 
+from napari_fiberburst.operators.grid import Grid
+
+# Nodes from one control point to the next of a table. Between them, a linear spline is off by 1/2000 of the second
+# difference of control points, along x and along y.
+_NODES = 16
+
 
 @dataclass(frozen=True, slots=True)
 class ControlGrid:
@@ -49,9 +55,18 @@ class ControlGrid:
         index = row[:, :, None] * columns + column[:, None, :]
         return index.flatten(1), (along_y[:, :, None] * along_x[:, None, :]).flatten(1)
 
-    def rows_at(self, points: Tensor) -> "_Rows":
-        """Return what takes values at control points to values at frame points (N, 2), where no adjoint is needed."""
-        return _Rows.of(*self.splines(points))
+    @property
+    def nodes(self) -> Grid:
+        """The nodes of a table over what the splines cover."""
+        rows, columns = (_NODES * (count - 3) + 1 for count in self.shape)
+        return Grid(0.0, 0.0, self.spacing / _NODES, (rows, columns))
+
+    def table(self, control: Tensor) -> Tensor:
+        """Return the values of splines (..., M) at the nodes of a table, (..., rows, columns)."""
+        table: Tensor = control.reshape(*control.shape[:-1], *self.shape)
+        for axis in (-1, -2):
+            table = _between(table.movedim(axis, -1)).movedim(-1, axis)
+        return table
 
     def at(self, points: Tensor) -> "ControlWeights":
         """Return the operator from values at control points to values at frame points (N, 2)."""
@@ -66,8 +81,16 @@ class ControlGrid:
         )
 
 
+def _between(values: Tensor) -> Tensor:
+    """Return cubic splines of control values (..., K) at the nodes of a table, (..., _NODES (K - 3) + 1)."""
+    weight = _cubic(torch.arange(_NODES, device=values.device).to(values) / _NODES)
+    inner = (values.unfold(-1, 4, 1)[..., None, :] * weight).sum(dim=-1).flatten(-2)
+    last = (values[..., -4:] * _cubic(values.new_ones(1))).sum(dim=-1, keepdim=True)
+    return torch.cat([inner, last], dim=-1)
+
+
 def _cubic(offset: Tensor) -> Tensor:
-    """Return the four cubic B-splines at offsets (N,) in [0, 1) from the second of their knots, (N, 4)."""
+    """Return the four cubic B-splines at offsets (N,) in [0, 1] from the second of their knots, (N, 4)."""
     rest = 1 - offset
     splines = [
         rest**3,
@@ -160,8 +183,17 @@ class Displacement:
         return cls(grid, torch.zeros(count, 2, grid.shape[0] * grid.shape[1], device=device))
 
     def at(self, points: Tensor) -> Tensor:
-        """Return the displacement of every frame at points (N, 2), (T, N, 2)."""
-        return (self.grid.rows_at(points) @ self.control.to(points)).mT
+        """Return the displacement of every frame at points (N, 2), (T, N, 2).
+
+        Many points read it from a table, because four nodes are sooner read than sixteen splines.
+        """
+        nodes, control = self.grid.nodes, self.control.to(points)
+        if len(points) <= math.prod(nodes.shape):
+            return (_Rows.of(*self.grid.splines(points)) @ control).mT
+        rows, columns = nodes.shape
+        last = points.new_tensor([columns - 1, rows - 1]) * nodes.spacing
+        read = nodes.at(torch.minimum(points.clamp_min(0), last))
+        return torch.stack([read.of_channels(frame) for frame in self.grid.table(control)])
 
     def of_frame(self, number: int) -> "Displacement":
         """Return the displacement of one frame alone."""
