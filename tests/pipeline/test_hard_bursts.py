@@ -209,6 +209,13 @@ def test_frames_of_noise_give_one_frame_and_say_so(rng, tmp_path):
     assert load(tmp_path / "noise.npz").frames_used == result.frames_used
 
 
+def test_the_frame_that_stands_for_those_that_cannot_be_registered_is_the_first_that_shows_as_much_as_they_do(rng):
+    frames = rng.random((5, 61, 67)).astype(np.float32)
+    assert reconstruct(Burst(frames)).frames_used == (0,)
+    frames[0] *= 0.1
+    assert reconstruct(Burst(frames)).frames_used == (1,)
+
+
 def test_the_smallest_burst_that_is_allowed(rng):
     result = reconstruct(Burst(rng.random((2, 16, 16)).astype(np.float32)))
     assert result.image.shape == (16, 16)

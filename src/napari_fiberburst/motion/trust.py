@@ -23,6 +23,8 @@ _LEAST_OF_USUAL = 0.6
 # A registration that leaves more unexplained than this has failed, or the model is wrong. Of simulated bursts those
 # that are registered to some tenths of a pixel leave up to 0.2 without noise, and those that are not 0.26 and more.
 MOST_UNEXPLAINED = 0.22
+# Frames that are brighter or darker than the median frame by more than this factor do not stand for the others.
+_BRIGHTNESS = 2.0
 
 
 def _evened(found: Registration, samples: Samples) -> Tensor:
@@ -69,13 +71,15 @@ def still(found: Registration) -> Registration:
 
 
 def alone(found: Registration, samples: Samples) -> Registration:
-    """Return a registration of one frame: that of median brightness, which is neither black nor over-exposed."""
+    """Return a registration of one frame: the first that is about as bright as most of those that show anything."""
     if len(found.used) > 1:
         found = _noted(
             found, "the frames could not be registered to one another; the image is made of one of them alone"
         )
-    brightness = samples.grey.mean(dim=1).cpu().numpy()
-    used = np.arange(len(found.used)) == int(np.argsort(brightness)[len(brightness) // 2])
+    brightness, shows = samples.grey.mean(dim=1).cpu().numpy(), samples.weights.any(dim=1).cpu().numpy()
+    usual = np.median(brightness[shows]) if shows.any() else 0.0
+    is_usual = shows & (brightness >= usual / _BRIGHTNESS) & (brightness <= usual * _BRIGHTNESS)
+    used = np.arange(len(found.used)) == int(np.argmax(is_usual))
     return still(replace(found, used=used, frame_weights=used.astype(np.float32)))
 
 

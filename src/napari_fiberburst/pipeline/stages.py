@@ -4,6 +4,7 @@ Every function here is a generator that yields what is known so far and returns 
 it can stop between any two steps and still have something to draw.
 """
 
+import itertools
 import logging
 import math
 from collections.abc import Generator
@@ -54,6 +55,8 @@ _SHORT_TRAVEL = 0.7
 _ENOUGH_SAMPLES, _MOST_DRAWS = 40_000, 8
 # Corrections of given gains (root mean square) that are worth a note, and that no bundle needs that was measured well.
 _LARGE_CORRECTION, _ANOTHER_BUNDLE = 0.03, 0.12
+# Refining by pixels takes long and shows more than cores did: there is an image after so many rounds.
+_SKETCHED_AFTER = 3
 # Part of a normal distribution that lies within one standard deviation.
 _WITHIN_ONE_SIGMA = 0.683
 
@@ -326,10 +329,12 @@ class Stages:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples, outliers=outliers)
         steps = self._refining(samples, registration, fitted.mount)
-        while True:
+        for rounds in itertools.count(1):
             try:
                 registration, samples = next(steps)
                 fitted = replace(fitted, registration=registration, samples=samples)
+                if kind == "pixels" and rounds == _SKETCHED_AFTER:
+                    fitted = self._sketched(fitted)
                 yield fitted
             except StopIteration as end:
                 registration, samples = end.value
