@@ -17,8 +17,10 @@ from napari_fiberburst.settings import Settings
 
 # Reports make the host wait for the device, so there are few of them, and more would not be seen.
 _SECONDS_BETWEEN_REPORTS = 0.1
-# Drawing an image asks a network for every pixel: watching takes at most this part of the time of a fit.
+# Drawing an image asks a network for every pixel: a fit waits until that is this part of its time, or no longer than so
+# many seconds where that leaves at least so many times as long for the fit itself, because somebody is watching.
 _PREVIEWS_SHARE = 0.05
+_LONGEST_WAIT, _LEAST_FOR_THE_FIT = 1.3, 3.0
 
 Draw = Callable[[], NDArray[np.float32]]
 
@@ -185,9 +187,15 @@ class _Previews:
         if self._every is None or snapshot.draw is None:
             return None
         before = clock.seconds
-        if not snapshot.is_milestone and before - self._drawn < max(self._every, self._cost / _PREVIEWS_SHARE):
+        if not snapshot.is_milestone and before - self._drawn < max(self._every, self._wait):
             return None
         image = snapshot.draw()
         self._drawn = clock.seconds
         self._cost = self._drawn - before
         return image
+
+    @property
+    def _wait(self) -> float:
+        """Seconds from one image to the next that watching is worth, by what the last one has cost."""
+        longest = max(_LONGEST_WAIT, self._cost * _LEAST_FOR_THE_FIT)
+        return min(self._cost / _PREVIEWS_SHARE, longest)

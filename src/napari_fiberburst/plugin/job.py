@@ -240,7 +240,14 @@ def _explain(error: Exception) -> str:
 
 
 def load_solver() -> dict[str, str]:
-    """Load PyTorch, which takes seconds, ahead of the first run; return the devices that are not here, and why."""
+    """Load PyTorch, which takes seconds, ahead of the first run; return the devices that are not here, and why.
+
+    So is what napari makes shapes with, pandas among it, because the first outlines would wait for it half a second.
+    """
+    from napari.layers import Shapes
+
     from napari_fiberburst.device import missing_devices
 
-    return missing_devices()
+    missing = missing_devices()
+    Shapes(np.array([[0.0, 0.0], [1.0, 1.0]]), shape_type="rectangle")
+    return missing
