@@ -4,7 +4,6 @@ Every function here is a generator that yields what is known so far and returns 
 it can stop between any two steps and still have something to draw.
 """
 
-import itertools
 import logging
 import math
 from collections.abc import Generator
@@ -329,9 +328,11 @@ class Stages:
             samples = replace(samples, weights=samples.weights * ~outliers[:, samples.core_index])
         fitted = replace(fitted, bundle=bundle, registration=registration, samples=samples, outliers=outliers)
         steps = self._refining(samples, registration, fitted.mount)
-        for rounds in itertools.count(1):
+        rounds = 0
+        while True:
             try:
                 registration, samples = next(steps)
+                rounds += 1
                 fitted = replace(fitted, registration=registration, samples=samples)
                 if kind == "pixels" and rounds == _SKETCHED_AFTER:
                     fitted = self._sketched(fitted)
