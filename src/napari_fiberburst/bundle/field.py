@@ -11,7 +11,9 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from napari_fiberburst.bundle.samples import SATURATED
+from napari_fiberburst.bundle.bundle import Bundle
+from napari_fiberburst.bundle.samples import SATURATED, only_exposed
+from napari_fiberburst.data.burst import Acquisition
 from napari_fiberburst.operators.filters import local_mean
 
 # Light, and how much it changes, are averaged over so many pixels, or pitches if that is more: gaps between cores are
@@ -89,6 +91,23 @@ def find_field(frames: Tensor, pitch: float | None = None) -> Tensor:
     bays = ndimage.binary_opening(~(lit | changes), _disc(round(_BAY * min(hull.shape))))
     field = ~_joined_to_border(bays | ~hull)
     return torch.from_numpy(_large_parts(field)).to(frames.device)
+
+
+def dark_places(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Tensor | None:
+    """Return where no light comes from and no core is seen, (H, W) bool: beyond the bundle, or before a dark object.
+
+    None where the frames (T, H, W) in [0, 1] have no such place. Cores that are dead or covered have light about them.
+    """
+    beyond = torch.from_numpy(~bundle.outline).to(frames.device)
+    if not bool(beyond.any()):
+        return None
+    black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
+    light = local_mean((only_exposed(frames).mean(dim=0) - black).clamp_min(0), bundle.pitch)
+    lit = light[~beyond]
+    if not len(lit):
+        return None
+    dark = beyond & (light < _DARK * float(np.quantile(lit.cpu().numpy(), 0.95)))
+    return dark if bool(dark.any()) else None
 
 
 def find_marks(frames: Tensor) -> Tensor:

@@ -42,11 +42,12 @@ _RING, _BESIDE = 0.15, (1.25, 1.55)
 _ROUNDS, _STEPS, _MOST_STEP = 2, 4, 0.5
 # The bundle moves where following it gives the mean of the frames at least so many times the power about the ring.
 # Where it rests, an object of bright points gives up to 1.013 in 12 frames, and more in few, because these average over
-# less of it; a bundle that moves by a twentieth of a pitch, halfway through the burst, gives 1.02.
+# less of it; a bundle that moves by a twentieth of a pitch, halfway through the burst, gives 1.02. Before cells on a
+# dark ground frames show different cores, are less alike, and following the cells gains more in the same measure.
 _LEAST_GAIN, _LEAST_GAIN_OF_FRAMES = 1.02, 0.3
 # The power of the ring in that mean, in parts of the power beside it: bundles have over 10. An object that was
-# followed, because the bundle is too faint beside it, has 1.2.
-_LEAST_RING = 4.0
+# followed, because the bundle is too faint beside it, has 1.2, and cells or beads on a dark ground up to 7.4.
+_LEAST_RING = 8.0
 # A frame that agrees with the others less than this part of the median frame does not show the bundle.
 _LEAST_OF_USUAL = 0.3
 # Pixels: a part of a pixel below which interpolation changes nothing; and frames without more that are enough.
@@ -132,8 +133,10 @@ def find_mount(grey: Tensor) -> Mount | None:
         mean = mean + patterns.moved_back(offsets[number : number + 1], number)[0]
     for _ in range(_ROUNDS):
         offsets = patterns.refined(patterns.others(offsets), offsets)
-    gain = patterns.power(offsets) / patterns.power(torch.zeros_like(offsets))
-    if gain < max(_LEAST_GAIN, 1 + _LEAST_GAIN_OF_FRAMES / len(used)) or patterns.ring(offsets) < _LEAST_RING:
+    power = patterns.power(offsets)
+    gain, alike = power / patterns.power(torch.zeros_like(offsets)), power / (len(used) * (len(used) - 1))
+    least = max(_LEAST_GAIN, 1 + _LEAST_GAIN_OF_FRAMES / len(used) / max(alike, 1e-9))
+    if gain < least or patterns.ring(offsets) < _LEAST_RING:
         return None
     agreement = steady.complex_product(patterns.moved_back(offsets), patterns.others(offsets).conj()).real.sum(dim=1)
     shows = agreement > _LEAST_OF_USUAL * agreement.median()

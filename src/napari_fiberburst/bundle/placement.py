@@ -31,13 +31,17 @@ _MARGIN_SHIFT, _MARGIN_ROTATION = 5.0, 1.0
 _ANGLE_STEP, _NEAR = 0.35, 0.25
 # Pitches: over this much the slow changes of the frames are divided out.
 _ENVELOPE = 3.0
-# Part of the light of the brightest place that a place has at least to show its cores.
-_LEAST_LIT = 0.05
+# Light is averaged over so many pitches (standard deviation). A place shows its cores where it has this part of the
+# light of the brightest place, or is among the brightest places, this part of all: behind cells on a dark ground, cores
+# that are asked further out are not there.
+_LIGHT, _LEAST_LIT, _BRIGHTEST = 0.7, 0.3, 0.1
+# Part of the light of the brightest surroundings below which nothing is compared.
+_DARK = 0.02
 # Share of the cores in the frames that must be found in their places. Another bundle has 0.2, the area of the circle
 # in which a core counts as found; the same one has over 0.9, and in noise or behind a dark object somewhat less.
 _LEAST_FOUND = 0.6
 # Correlation of the brightness of cores with that of their neighbours taken out. A bundle with a perfect lattice can
-# be confused with another one, or with itself a pitch away, by places alone.
+# be confused with another one, or with itself a pitch away, by places alone. Another bundle has up to 0.18.
 _LEAST_ALIKE = 0.25
 # Cores whose brightness is a guess that differs by less than this part were taken as equal: places alone tell them.
 _LEAST_DIFFERENT = 0.1
@@ -192,8 +196,10 @@ def _is_it(found: tuple[float, float]) -> bool:
 def _flattened(image: Tensor, pitch: float) -> tuple[Tensor, Tensor]:
     """Return an image (H, W) divided by itself blurred, 0 where there is no light; and where there is light."""
     envelope = local_mean(image, _ENVELOPE * pitch)
-    lit = envelope > _LEAST_LIT * envelope.max()
-    return torch.where(lit, image / envelope.clamp_min(1e-6), torch.zeros_like(image)), lit
+    light = local_mean(image, _LIGHT * pitch)
+    least = min(_LEAST_LIT * float(light.max()), float(np.quantile(light.cpu().numpy(), 1 - _BRIGHTEST)))
+    flat = image / envelope.clamp_min(1e-6)
+    return torch.where(envelope > _DARK * envelope.max(), flat, torch.zeros_like(image)), light > least
 
 
 def _searched(bundle: Bundle, observed: Observed) -> NDArray[np.float64]:

@@ -40,6 +40,8 @@ class Fitted:
         What a user should know, beside the notes of the registration.
     noise : Noise or None
         Of the camera; None where it cannot be told, or not yet.
+    dark : Tensor or None
+        (H, W) bool, frame pixels without a core that no frame shows light at; None if there are none.
     outliers : Tensor or None
         (T, G) bool, cores that were seen to show something else before the scene was solved; None if none were.
     """
@@ -54,6 +56,7 @@ class Fitted:
     image: SplineImage | None = None
     notes: tuple[str, ...] = ()
     noise: Noise | None = None
+    dark: Tensor | None = None
     outliers: Tensor | None = None
 
     @property

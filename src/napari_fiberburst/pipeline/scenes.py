@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from napari_fiberburst.bundle.samples import Samples
 from napari_fiberburst.data.burst import Acquisition
@@ -63,7 +64,7 @@ class Scenes:
         grid = self.grid(fitted)
         smoothness = self._method.smoothness
         if draft is None:
-            steps = drafting(samples, fitted.registration, grid, is_asked=smoothness is None)
+            steps = drafting(samples, fitted.registration, grid, is_asked=smoothness is None, dark=_dark(fitted, grid))
             fitted, draft = yield from self._drawn(fitted, steps)
             if draft.smear is not None:
                 fitted, draft = yield from self._drawn_again(fitted, draft, grid)
@@ -75,6 +76,7 @@ class Scenes:
             smoothness=smoothness,
             held_out=self._method.held_out,
             seed=self._seed,
+            dark=_dark(fitted, grid),
         )
         fitted, scene = yield from self._drawn(fitted, final)
         return replace(self.with_scene(fitted, scene), draft=draft)
@@ -90,7 +92,8 @@ class Scenes:
         if registration is before:
             return fitted, draft
         yield fitted
-        steps = drafting(samples, registration, grid, is_asked=self._method.smoothness is None)
+        dark = _dark(fitted, grid)
+        steps = drafting(samples, registration, grid, is_asked=self._method.smoothness is None, dark=dark)
         return (yield from self._drawn(replace(fitted, registration=registration), steps))
 
     def without_left_out(self, fitted: Fitted) -> Fitted:
@@ -103,7 +106,8 @@ class Scenes:
         """Solve a coarse scene from some samples, for a preview."""
         spacing = max(_PREVIEW_SPACING / self._method.upsample, _PREVIEW_PITCHES * fitted.bundle.pitch)
         grid = self._grid_of(spacing, fitted)
-        return self.with_scene(fitted, solve_quickly(samples, registration, grid, self._method.smoothness))
+        dark = _dark(fitted, grid)
+        return self.with_scene(fitted, solve_quickly(samples, registration, grid, self._method.smoothness, dark))
 
     def with_scene(self, fitted: Fitted, scene: Scene) -> Fitted:
         """Return what is known with another scene, and the image that it stands for."""
@@ -154,3 +158,13 @@ class Scenes:
                 yield fitted
             except StopIteration as end:
                 return fitted, end.value
+
+
+def _dark(fitted: Fitted, grid: Grid) -> Tensor | None:
+    """Return nodes where the reference frame is dark, (H, W) bool; None if there are none."""
+    if fitted.dark is None:
+        return None
+    height, width = fitted.dark.shape
+    column, row = grid.nodes().round().long().unbind(dim=-1)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return inside & fitted.dark.cpu()[row.clamp(0, height - 1), column.clamp(0, width - 1)]

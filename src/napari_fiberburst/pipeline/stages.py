@@ -16,7 +16,7 @@ from torch import Tensor
 
 from napari_fiberburst.bundle.bundle import Bundle
 from napari_fiberburst.bundle.calibrate import calibrating, plain_frames, remark, shows_the_object, with_even_gains
-from napari_fiberburst.bundle.field import find_marks, widened
+from napari_fiberburst.bundle.field import dark_places, find_marks, widened
 from napari_fiberburst.bundle.mount import Mount, find_mount
 from napari_fiberburst.bundle.noise import Noise, measure_noise
 from napari_fiberburst.bundle.placement import find_bundle
@@ -144,6 +144,7 @@ class Stages:
             canvas=self._scenes.frame_canvas,
             mount=mount,
             notes=(*steadied, *notes),
+            dark=dark_places(self._grey, bundle, self._burst),
         )
         fitted = self._glimpsed(fitted, samples)
         yield fitted

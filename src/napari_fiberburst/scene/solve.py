@@ -29,6 +29,8 @@ _DRAFT_ITERATIONS = 32
 # From a scene that has some samples which it should not.
 _MORE_ITERATIONS = 24
 PREVIEW_ITERATIONS = 8
+# In pitches (standard deviation): over this distance a place has samples nearby.
+_NEAR = 0.5
 # Outliers are looked for so many times: in the first scene, they are in the scene too.
 _OUTLIER_ROUNDS = 2
 
@@ -179,14 +181,17 @@ def grid_over(bounds: tuple[float, float, float, float], spacing: float, reach: 
     return Grid.over((x0 - margin, y0 - margin, x1 + margin, y1 + margin), spacing)
 
 
-def solve_quickly(samples: Samples, registration: Registration, grid: Grid, smoothness: float | None) -> Scene:
-    """Return a first scene, for a preview."""
+def solve_quickly(
+    samples: Samples, registration: Registration, grid: Grid, smoothness: float | None, dark: Tensor | None = None
+) -> Scene:
+    """Return a first scene, for a preview; `dark` as for `drafting`."""
     return _draft(
         registration.correct(samples),
         registration.points(samples.positions),
         grid,
         smoothness,
         iterations=PREVIEW_ITERATIONS,
+        dark=dark,
     )
 
 
@@ -218,16 +223,17 @@ def solving(
 
 
 def drafting(
-    samples: Samples, registration: Registration, grid: Grid, *, is_asked: bool
+    samples: Samples, registration: Registration, grid: Grid, *, is_asked: bool, dark: Tensor | None = None
 ) -> Generator[Scene, None, Draft]:
     """Learn from a first scene what solving needs to know of the samples; yields that scene, twice.
 
     It does not depend on the smoothness that the scene will have, so one draft serves them all. `is_asked` tells
-    whether the burst is to choose that; what halves of it agree on is found anyhow.
+    whether the burst is to choose that; what halves of it agree on is found anyhow. `dark` are nodes where frames are
+    dark, (H, W) bool, as `NormalEquations.darkened` takes them.
     """
     samples = registration.correct(samples)
     points = registration.points(samples.positions)
-    scene = _draft(samples, points, grid, None)
+    scene = _draft(samples, points, grid, None, dark=dark)
     if not registration.is_still:
         samples, gains = refine_gains(samples, points, grid, scene.filtered)
         scene = _without_outliers(replace(scene, samples=samples, gains=gains), points)
@@ -259,13 +265,14 @@ def finishing(
     smoothness: float | None,
     held_out: float,
     seed: int,
+    dark: Tensor | None = None,
 ) -> Generator[Scene, None, Scene]:
     """Solve the scene for good from its draft; yields it before held-out samples are taken in."""
     weight = smoothness or draft.smoothness or UNTOLD
     looks, samples = draft.looks(samples, registration), draft.refined(samples, registration)
     left_out = _left_out(samples, held_out, seed)
     equations = assemble(grid, samples, looks, (~left_out).to(looks))
-    coefficients = equations.solve(weight, draft.coefficients)
+    coefficients = _darkened(equations, dark, samples).solve(weight, draft.coefficients)
     missed, mass = misfit(samples, looks, grid, equations.through(coefficients), left_out)
     scene = Scene(
         coefficients=coefficients,
@@ -283,7 +290,7 @@ def finishing(
     if not left_out.any():
         return scene
     equations = equations + assemble(grid, samples, looks, left_out.to(looks))
-    coefficients = equations.solve(weight, coefficients)
+    coefficients = _darkened(equations, dark, samples).solve(weight, coefficients)
     return replace(scene, coefficients=coefficients, equations=equations.without_paths())
 
 
@@ -293,11 +300,17 @@ def _draft(
     grid: Grid,
     smoothness: float | None,
     iterations: int = _DRAFT_ITERATIONS,
+    dark: Tensor | None = None,
 ) -> Scene:
     equations = assemble(grid, samples, points)
     weight = UNTOLD if smoothness is None else smoothness
-    coefficients = equations.solve(weight, iterations=iterations)
+    coefficients = _darkened(equations, dark, samples).solve(weight, iterations=iterations)
     return Scene(coefficients=coefficients, smoothness=weight, equations=equations, samples=samples, gains=GainChange())
+
+
+def _darkened(equations: NormalEquations, dark: Tensor | None, samples: Samples) -> NormalEquations:
+    """Return the equations to solve. Those to keep are of the samples alone: nothing was measured in the dark."""
+    return equations if dark is None else equations.darkened(dark, _NEAR * samples.pitch)
 
 
 def _without_outliers(scene: Scene, points: Tensor) -> Scene:

@@ -40,6 +40,9 @@ _FREQUENCIES = 33
 _SAMPLES_TOGETHER = 200_000
 # Nodes with less than this part of the densest sampling are beyond what was seen.
 _LEAST_DENSITY = 0.05
+# Where frames are dark and no sample has looked, a node weighs so many samples of no light: enough for the prior to let
+# go within some pixels.
+_DARK_WEIGHT = 0.02
 # Nodes repeated beyond the edge, so that a filter finds no step there.
 _RIM = 8
 
@@ -126,6 +129,23 @@ class NormalEquations:
         bands, rhs = (part.new_zeros(len(part), *grid.shape) for part in (self.bands, self.rhs))
         bands[:, *there], rhs[:, *there] = self.bands[:, *here], self.rhs[:, *here]
         return replace(self, grid=grid, bands=bands, rhs=rhs)
+
+    def darkened(self, dark: Tensor, reach: float) -> "NormalEquations":
+        """Return the equations of a scene that is black where frames are dark and no sample has looked nearby.
+
+        A thin plate goes on as it ends, so beyond the last samples it would rise into fog.
+
+        Parameters
+        ----------
+        dark : Tensor
+            (H, W) bool, nodes where frames are dark.
+        reach : float
+            Pixels, over what distance samples are near.
+        """
+        near = blur(self.density(), reach / self.grid.spacing) / (_LEAST_DENSITY * self._usual_density())
+        bands = self.bands.clone()
+        bands[0] += _DARK_WEIGHT * dark.to(bands.device) * (1 - near).clamp_min(0)
+        return replace(self, bands=bands)
 
     def without_paths(self) -> "NormalEquations":
         """Return the equations to keep once they are solved: of the middle of each path."""
