@@ -82,14 +82,15 @@ def test_what_fits_in_no_number_of_parts_is_refused_and_told(burst, choices):
 
 def test_one_value_a_core_is_taken_where_pixels_do_not_fit():
     burst = simulate("histology", shape=(127, 141), frames=8, pitch=6.0, channels=1, seed=3).burst
-    assert reconstruct(burst).settings.flat()["observation"] == "pixels"
+    assert reconstruct(burst, iterations=1).settings.flat()["observation"] == "pixels"
     cores = estimate_memory(burst.shape, choose(), kind="cores", samples=500)
     pixels = estimate_memory(burst.shape, choose(), kind="pixels", samples=9000)
-    result = reconstruct(burst, memory=f"{(cores + pixels) / 2e6:.1f} MB")
+    memory = f"{(cores + pixels) / 2e6:.1f} MB"
+    result = reconstruct(burst, iterations=1, memory=memory)
     assert result.settings.flat()["observation"] == "cores"
     assert any("memory does not allow" in note for note in result.notes)
     with pytest.raises(FiberBurstError, match="memory allows"):
-        reconstruct(burst, observation="pixels", memory=f"{(cores + pixels) / 2e6:.1f} MB")
+        reconstruct(burst, observation="pixels", iterations=1, memory=memory)
 
 
 @pytest.mark.parametrize("error", ENDINGS, ids=lambda error: type(error).__name__)

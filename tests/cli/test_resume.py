@@ -68,24 +68,21 @@ def test_what_a_script_has_begun_is_told(clip, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(mosaics, "draw_unit", stop)
     with pytest.raises(KeyboardInterrupt):
-        mosaic(open_recording(clip), tmp_path / "m.ome.zarr")
+        mosaic(open_recording(clip), tmp_path / "m.ome.zarr", dof=2)
     assert main(["resume", str(tmp_path / "m.ome.zarr")]) == 2
     assert "was begun by a script: run that again" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("told", "why"),
-    [
+def test_a_command_that_was_altered_is_not_run(clip, tmp_path, stop_drawing, capsys):
+    stop_drawing(["mosaic", str(clip), "-o", str(tmp_path / "m.ome.zarr"), "--motion", "translation"])
+    for told, why in (
         ('{"words": ["simulate", "-o", "b.tif"], "folder": "/"}', "a command that cannot go on: 'simulate'"),
         ('{"words": "mosaic", "folder": "/"}', "command.json is damaged"),
         ('{"words": ["mosaic"], "folder": "/not/here"}', "which is not there"),
-    ],
-)
-def test_a_command_that_was_altered_is_not_run(clip, tmp_path, stop_drawing, capsys, told, why):
-    stop_drawing(["mosaic", str(clip), "-o", str(tmp_path / "m.ome.zarr")])
-    (tmp_path / "m.work" / "command.json").write_text(told)
-    assert main(["resume", str(tmp_path / "m.ome.zarr")]) == 2
-    assert why in capsys.readouterr().err
+    ):
+        (tmp_path / "m.work" / "command.json").write_text(told)
+        assert main(["resume", str(tmp_path / "m.ome.zarr")]) == 2
+        assert why in capsys.readouterr().err
 
 
 def test_what_is_no_run_is_told(tmp_path, capsys):

@@ -1,6 +1,8 @@
 """A fit of networks that was killed goes on from its checkpoint, to the bits that it would have come to."""
 
+import shutil
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from napari_fiberburst.networks.training import Problem
 from napari_fiberburst.pipeline.checkpoint import Checkpoint
 from napari_fiberburst.simulation import simulate
 
+SMALL = {"scene_width": 16, "scene_layers": 2, "batch": 256}
 METHODS = {
-    "network": {"encoding": "fourier", "iterations": 40, "features": 16},
-    "grid": {"encoding": "hash", "iterations": 40, "held_out": 0.1},
+    "network": {"encoding": "fourier", "iterations": 40, "features": 16, **SMALL},
+    "grid": {"encoding": "hash", "iterations": 40, "held_out": 0.1, "levels": 8, **SMALL},
     "paper": {"preset": "paper", "iterations": 40, "batch": 500},
 }
 
@@ -25,6 +28,12 @@ class KilledError(Exception):
 @pytest.fixture(scope="module")
 def burst():
     return simulate("histology", shape=(45, 52), frames=6, pitch=4.0, physics="core", seed=2).burst
+
+
+@pytest.fixture(scope="module")
+def whole(burst):
+    """Return a function that gives what a method comes to where nothing ends its run."""
+    return cache(lambda method: reconstruct(burst, **METHODS[method]))
 
 
 def once_kept(path, step, end):
@@ -46,30 +55,35 @@ def run_until_killed(burst, path, choices, step):
         reconstruct(burst, **choices, checkpoint=path, checkpoint_every=1e-9, on_progress=once_kept(path, step, killed))
 
 
-@pytest.fixture
-def kept(burst, tmp_path):
-    """Return the checkpoint of a run that was killed."""
-    path = tmp_path / "run.checkpoint"
+@pytest.fixture(scope="module")
+def left_behind(burst, tmp_path_factory):
+    """Return the checkpoint of a run that was killed; it is not to be written to."""
+    path = tmp_path_factory.mktemp("killed") / "run.checkpoint"
     run_until_killed(burst, path, METHODS["network"], 5)
     return path
 
 
+@pytest.fixture
+def kept(left_behind, tmp_path):
+    """Return a checkpoint of a run that was killed, for this test alone."""
+    return shutil.copy(left_behind, tmp_path / "run.checkpoint")
+
+
 @pytest.mark.parametrize("method", METHODS)
-def test_a_killed_run_goes_on_to_the_same_bits(burst, tmp_path, method, same, monkeypatch):
-    path, choices = tmp_path / "run.checkpoint", METHODS[method]
-    whole = reconstruct(burst, **choices)
+def test_a_killed_run_goes_on_to_the_same_bits(burst, whole, tmp_path, method, same, monkeypatch):
+    path, choices, expected = tmp_path / "run.checkpoint", METHODS[method], whole(method)
     for step in (3, 22):
         run_until_killed(burst, path, choices, step)
     left, step_once = [], Problem.step
     monkeypatch.setattr(Problem, "step", lambda problem: left.append(1) or step_once(problem))
     gone_on = reconstruct(burst, **choices, checkpoint=path)
-    same(gone_on, whole)
-    assert len(left) <= len(whole.losses) - 22
+    same(gone_on, expected)
+    assert len(left) <= len(expected.losses) - 22
     assert gone_on.seconds > Checkpoint.load(path).seconds
-    assert gone_on.held_out_rmse == whole.held_out_rmse
+    assert gone_on.held_out_rmse == expected.held_out_rmse
 
 
-def test_a_stopped_run_is_kept_where_it_stopped(burst, tmp_path, same):
+def test_a_stopped_run_is_kept_where_it_stopped(burst, whole, tmp_path, same):
     path, control = tmp_path / "run.checkpoint", Control()
     choices = {**METHODS["network"], "checkpoint": path}
     stopped = reconstruct(
@@ -77,10 +91,10 @@ def test_a_stopped_run_is_kept_where_it_stopped(burst, tmp_path, same):
     )
     assert stopped.ending == "stopped"
     assert Checkpoint.load(path).now.step == len(stopped.losses)
-    same(reconstruct(burst, **choices), reconstruct(burst, **METHODS["network"]))
+    same(reconstruct(burst, **choices), whole("network"))
 
 
-def test_a_disk_that_is_full_does_not_end_the_run(burst, tmp_path, monkeypatch, caplog, same):
+def test_a_disk_that_is_full_does_not_end_the_run(burst, whole, tmp_path, monkeypatch, caplog, same):
     path, save, tries = tmp_path / "run.checkpoint", Checkpoint.save, []
 
     def full(checkpoint, path):
@@ -90,10 +104,7 @@ def test_a_disk_that_is_full_does_not_end_the_run(burst, tmp_path, monkeypatch, 
         return save(checkpoint, path)
 
     monkeypatch.setattr(Checkpoint, "save", full)
-    same(
-        reconstruct(burst, **METHODS["network"], checkpoint=path, checkpoint_every=1e-9),
-        reconstruct(burst, **METHODS["network"]),
-    )
+    same(reconstruct(burst, **METHODS["network"], checkpoint=path, checkpoint_every=1e-9), whole("network"))
     assert Checkpoint.load(path).now.step == tries[0]
     assert f"the run goes on, but could not be kept: {path} cannot be written" in caplog.text
 

@@ -79,7 +79,7 @@ def test_a_network_that_is_stopped_while_it_learns_can_be_repeated(burst):
 
 def test_an_end_that_was_left_open_is_told(burst, monkeypatch):
     monkeypatch.setattr("napari_fiberburst.pipeline.network._LEAST_PATIENCE", 20)
-    small = {"scene_width": 8, "scene_layers": 1, "levels": 4, "batch": 96, "learning_rate": 0.05}
+    small = {"scene_width": 8, "scene_layers": 1, "levels": 6, "batch": 96, "learning_rate": 0.1}
     result = reconstruct(burst, encoding="hash", **small)
     assert result.ending == "finished"
     assert result.settings.method.iterations == len(result.losses) < 2000

@@ -93,21 +93,18 @@ def test_a_frame_that_shows_nothing_is_left_out_and_named(cores, fitted, spoil, 
     assert any("left out: 4" in note for note in result.notes)
     assert "left out: 4" in caplog.text
     assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.0
+    # It is drawn as nothing.
+    assert np.isnan(result.frame(4)).all()
+    assert np.isnan(result.render(bounds=(-500, 0, -400, 50))).all()
+    assert np.isnan(result.flow(4)).all()
 
 
 def test_without_motion_asked_for_bad_frames_are_left_out_too():
     simulated = simulate("cat", shape=SHAPE, frames=6, pitch=5.0, physics="core", motion=still_to(6))
-    result = reconstruct(recorded(simulated, spoil_black), motion="none")
+    result = reconstruct(recorded(simulated, spoil_black), motion="none", smoothness=0.02)
     assert 4 not in result.frames_used
     assert any("equally bright" in note for note in result.notes)
     np.testing.assert_allclose(result.homographies[1], np.eye(3))
-
-
-def test_a_frame_that_was_left_out_is_drawn_as_nothing(cores):
-    result = reconstruct(recorded(cores, spoil_black), fill=True)
-    assert np.isnan(result.frame(4)).all()
-    assert np.isnan(result.render(bounds=(-500, 0, -400, 50))).all()
-    assert np.isnan(result.flow(4)).all()
 
 
 def test_where_frame_0_is_bad_the_next_takes_its_place(cores):
@@ -130,17 +127,13 @@ def test_a_duplicated_frame_does_no_harm(cores, fitted):
     assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.0
 
 
-def test_a_blurred_frame_counts_for_less():
-    simulated = simulate("cat", shape=SHAPE, frames=10, pitch=5.0, physics="core", seed=5)
-    moving = simulate("cat", shape=SHAPE, frames=10, pitch=5.0, physics="core", seed=5)
-    clear = reconstruct(simulated.burst, fill=True)
-
+def test_a_blurred_frame_counts_for_less(cores, fitted):
     def smear(frames):
         # Moved during the exposure: the sum of what frames 3 to 7 show.
-        frames[4] = moving.arrays()["frames"][3:8].mean(axis=0)
+        frames[4] = cores.arrays()["frames"][3:8].mean(axis=0)
 
-    result = reconstruct(recorded(simulated, smear), fill=True)
-    assert psnr(result.image, simulated.truth[0]) > psnr(clear.image, simulated.truth[0]) - 1.5
+    result = reconstruct(recorded(cores, smear), fill=True)
+    assert psnr(result.image, cores.truth[0]) > psnr(fitted.image, cores.truth[0]) - 1.5
 
 
 def test_a_bundle_in_a_circle_leaves_the_corners_empty():
@@ -270,7 +263,9 @@ def test_in_even_light_looking_for_shading_changes_nothing(cores, fitted):
 
 def test_without_motion_the_mean_frames_slow_changes_are_the_lights_where_that_is_asked_for():
     shaded = simulate("cat", faults=Faults(vignette=3), motion=still_to(12), **VIGNETTED)
-    equal, falling = (reconstruct(shaded.burst, flatten=flatten).bundle for flatten in ("motion", "frame"))
+    equal, falling = (
+        reconstruct(shaded.burst, flatten=flatten, smoothness=0.02).bundle for flatten in ("motion", "frame")
+    )
     distance = np.hypot(*(equal.centres - np.array(SHAPE[::-1]) / 2).T)
     dimmer = [
         bundle.brightness[distance > 60].mean() / bundle.brightness[distance < 40].mean() for bundle in (equal, falling)

@@ -84,7 +84,8 @@ def test_where_frame_0_is_bad_the_bundle_rests_where_the_reference_has_it(shifte
 
 
 def test_networks_learn_the_motion_of_the_frames_as_recorded(shifted):
-    result = reconstruct(shifted.burst, encoding="hash", iterations=60, device="cpu")
+    small = {"scene_width": 16, "scene_layers": 1, "levels": 8, "batch": 256}
+    result = reconstruct(shifted.burst, encoding="hash", iterations=60, device="cpu", **small)
     assert motion_error(result.homographies, shifted.homographies, SHAPE) < 0.2
 
 

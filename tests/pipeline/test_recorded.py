@@ -94,9 +94,10 @@ def test_motion_that_is_asked_for_is_not_replaced():
 
 
 @pytest.mark.parametrize("scene", ["histology", "tissue"])
-def test_what_passes_before_the_object_leaves_no_trace(scene):
+def test_what_passes_before_the_object_leaves_no_trace(clean, scene):
     free, simulated = recorded(scene), recorded(scene, intruder=0.05)
-    best, result = quality(reconstruct(free.burst), free), reconstruct(simulated.burst)
+    best = clean[2] if scene == "histology" else quality(reconstruct(free.burst), free)
+    result = reconstruct(simulated.burst)
     assert quality(result, simulated) > best - 1.7  # some of its frames are left out
     centres = result.bundle.centres.round().astype(int)
     hidden = simulated.intruder[:, centres[:, 1].clip(0, SHAPE[0] - 1), centres[:, 0].clip(0, SHAPE[1] - 1)] > 0.6

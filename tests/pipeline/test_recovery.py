@@ -16,7 +16,7 @@ NETWORKS = {
     "scene_width": 64,
     "scene_layers": 3,
     "motion_width": 64,
-    "batch": 2048,
+    "batch": 1024,
     "learning_rate": 5e-4,
     "device": "cpu",
 }
@@ -50,7 +50,7 @@ def test_homographies_and_scene_through_a_bundle(simulated, encoding):
     [
         {"motion": "flow", "flow_omega_0": 5.0},
         # The weight against a loss of narrower networks; the prior makes it slower.
-        {"motion": "flow_tv", "tv_weight": 0.05, "iterations": 800},
+        {"motion": "flow_tv", "tv_weight": 0.05, "iterations": 1000},
     ],
     ids=lambda motion: motion["motion"],
 )

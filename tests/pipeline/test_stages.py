@@ -54,9 +54,8 @@ def same(first, second):
     return first == second
 
 
-def test_the_steps_come_to_what_reconstruct_comes_to(cores, stages):
+def test_the_steps_come_to_what_reconstruct_comes_to(cores, fitted, stages):
     bundle, _, registration, scene = stages
-    fitted = reconstruct(cores.burst, fill=True)
     image = render(cores.burst, bundle, registration, scene, fill=True)
     assert image.shape == fitted.image.shape
     assert psnr(image, cores.truth[0]) == pytest.approx(psnr(fitted.image, cores.truth[0]), abs=0.1)

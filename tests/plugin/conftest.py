@@ -1,6 +1,8 @@
 """A viewer with the dock in it, and a burst to run; nothing is written to the user's own settings."""
 
-from collections.abc import Callable, Sequence
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +12,45 @@ import tifffile
 from napari.components import ViewerModel
 from napari.layers import Image
 from napari.utils import progress
+from npe2 import PluginManifest
 from qtpy.compat import isalive
 from qtpy.QtCore import QSettings
 
-from napari_fiberburst import Reconstruction
+from napari_fiberburst import Burst, Reconstruction
+from napari_fiberburst.pipeline import reconstruct as pipeline
 from napari_fiberburst.plugin.bursts import source_of
 from napari_fiberburst.plugin.dock import FiberBurstWidget
 from napari_fiberburst.plugin.kept_run import KeptRun
 from napari_fiberburst.plugin.layers import RunLayers
 from napari_fiberburst.plugin.placement import Placement
 from napari_fiberburst.plugin.runs import RunsPanel
+from napari_fiberburst.results.progress import Progress
 from napari_fiberburst.simulation import SimulatedBurst, simulate
 
 MILLISECONDS = 60_000
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _manifests_read_once() -> Iterator[None]:
+    """Read the manifests of all plugins once, and not for every window."""
+    found = tuple(PluginManifest.discover())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(PluginManifest, "discover", lambda paths=(): iter(found))
+        yield
+
+
+@pytest.fixture(scope="session")
+def _lasting() -> Iterator[None]:
+    """Give back at the end what `_short_collections` has set aside."""
+    yield
+    gc.unfreeze()
+
+
+@pytest.fixture(autouse=True)
+def _short_collections(_lasting) -> None:
+    """Set aside what was there before a test: napari collects all garbage when a layer goes, and looks at all of it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -66,13 +94,52 @@ def open_dock(make_napari_viewer, qtbot) -> Callable[..., Any]:
             dock.deleteLater()  # one that was taken out of its window is nobody else's to delete
 
 
-@pytest.fixture
-def run_through(qtbot) -> Callable[[FiberBurstWidget], Any]:
-    """Return a function that starts the dock, waits for the last layer, and returns the run."""
+class Remembering:
+    """Reconstructs a burst as chosen once in all tests; after that its reports and its result come at once."""
 
-    def ran(dock: FiberBurstWidget) -> Any:
-        with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
-            dock.picture.start()
+    def __init__(self) -> None:
+        self._known: dict[Any, tuple[list[Progress], Reconstruction]] = {}
+        self._make = pipeline.reconstruct
+
+    def __call__(self, burst: Burst, *, bundle: Any, initial: Any, on_progress: Any, **given: Any) -> Reconstruction:
+        steered = {name: given.pop(name) for name in ("control", "should_stop")}
+        if bundle is not None or initial is not None:
+            return self._make(burst, bundle=bundle, initial=initial, on_progress=on_progress, **steered, **given)
+        key = burst.frames.tobytes(), repr(burst.acquisition), repr(sorted(given.items()))
+        if key in self._known:
+            for report in self._known[key][0]:
+                on_progress(report)
+        else:
+            reports: list[Progress] = []
+
+            def take(report: Progress) -> None:
+                reports.append(report)
+                on_progress(report)
+
+            self._known[key] = reports, self._make(burst, on_progress=take, **steered, **given)
+        result = self._known[key][1]
+        return replace(result, image=result.image.copy())
+
+
+@pytest.fixture(scope="session")
+def remembering() -> Remembering:
+    """Return what reconstructs each burst once."""
+    return Remembering()
+
+
+@pytest.fixture
+def run_through(qtbot, remembering) -> Callable[..., Any]:
+    """Return a function that starts the dock, waits for the last layer, and returns the run.
+
+    What another test has run already is not computed again, unless it is asked for afresh.
+    """
+
+    def ran(dock: FiberBurstWidget, *, afresh: bool = False) -> Any:
+        with pytest.MonkeyPatch.context() as patch:
+            if not afresh:
+                patch.setattr(pipeline, "reconstruct", remembering)
+            with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
+                dock.picture.start()
         return dock.picture.runs.run
 
     return ran

@@ -64,6 +64,7 @@ def test_an_image_without_numbers_is_a_failure(open_dock, qtbot, burst_layer, mo
 
 def test_start_twice_is_one_run(open_dock, qtbot, burst_layer):
     _, dock = open_dock(burst_layer)
+    dock.picture.form.set_choices({"motion": "translation", "iterations": 1})
     with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
         dock.picture.start()
         dock.picture.start()
@@ -126,6 +127,8 @@ def test_two_docks_run_side_by_side(open_dock, qtbot, burst_layer):
     viewer, first = open_dock(burst_layer)
     second = FiberBurstWidget(viewer)
     viewer.window.add_dock_widget(second, name="second")
+    for dock in (first, second):
+        dock.picture.form.set_choices({"motion": "translation", "iterations": 1})
     with qtbot.waitSignals([first.picture.display.complete, second.picture.display.complete], timeout=MILLISECONDS):
         first.picture.start()
         second.picture.start()
@@ -152,12 +155,13 @@ def test_many_starts_and_stops_leave_nothing_behind(open_dock, qtbot, burst_laye
 
 def test_what_a_removed_run_held_is_let_go_when_the_next_one_starts(open_dock, run_through, qtbot, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    run = run_through(dock)
+    dock.picture.form.set_choices({"motion": "translation", "iterations": 1})
+    run = run_through(dock, afresh=True)
     gone = [weakref.ref(run.result), weakref.ref(viewer.layers["run 1: image"])]
     dock.picture.runs.remove(run)
     del run
     assert [layer.name for layer in viewer.layers] == ["burst"]
-    run_through(dock)  # until now it could have been brought back
+    run_through(dock, afresh=True)  # until now it could have been brought back
     gc.collect()
     assert [reference() for reference in gone] == [None, None]
     assert [layer.name for layer in viewer.layers] == ["burst", "run 1: image"]

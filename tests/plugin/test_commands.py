@@ -29,6 +29,7 @@ def hint(widget):
 
 def test_a_key_starts_starts_a_run(open_dock, burst_layer, qtbot):
     _, dock = open_dock(burst_layer)
+    dock.picture.form.set_choices({"motion": "translation", "iterations": 1})
     with qtbot.waitSignal(dock.picture.display.complete, timeout=MILLISECONDS):
         qtbot.keyClick(dock.picture.start_button, Qt.Key.Key_Return, Qt.KeyboardModifier.ControlModifier)
     assert [run.name for run in dock.picture.runs.runs] == ["run 1"]

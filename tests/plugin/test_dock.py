@@ -23,7 +23,7 @@ QUICK = {"preset": "paper", **NETWORK, "iterations": 2}
 
 def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated):
     viewer, dock = open_dock(burst_layer)
-    run = run_through(dock)
+    run = run_through(dock, afresh=True)
     assert run.result.ending == "finished"
     assert [layer.name for layer in viewer.layers] == ["burst", "run 1: image"]
     shown = viewer.layers["run 1: image"].data
@@ -38,7 +38,7 @@ def test_one_click_makes_an_image(open_dock, run_through, burst_layer, simulated
 
 def test_the_plugin_runs_the_same_reconstruction_as_a_script(open_dock, run_through, burst_layer, simulated):
     _, dock = open_dock(burst_layer)
-    run = run_through(dock)
+    run = run_through(dock, afresh=True)
     headless = pipeline.reconstruct(simulated.arrays()["frames"])
     # Sums in another thread may be taken in another order.
     np.testing.assert_allclose(run.result.image, headless.image, rtol=1e-4)
@@ -63,7 +63,7 @@ def test_the_signals_of_a_finished_run_come_in_order(open_dock, run_through, bur
     seen = []
     for name in ("started", "reported", "previewed", "finished", "stopped", "failed", "ready"):
         getattr(dock.picture.runner, name).connect(lambda *_, name=name: seen.append(name))
-    run_through(dock)
+    run_through(dock, afresh=True)
     assert seen[0] == "started"
     assert seen[-2:] == ["finished", "ready"]
     assert set(seen[1:-2]) == {"reported", "previewed"}
@@ -202,7 +202,7 @@ def test_curves_are_those_of_the_run_selected_whenever_they_are_opened(open_dock
 
 def test_the_history_goes_back_through_the_run(open_dock, run_through, burst_layer):
     viewer, dock = open_dock(burst_layer)
-    run = run_through(dock)
+    run = run_through(dock, afresh=True)
     assert len(run.history.entries) >= 2
     final = viewer.layers["run 1: image"].data.copy()
     dock.picture.display.slider.setValue(0)
@@ -216,7 +216,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     from qtpy.QtWidgets import QApplication
 
     viewer, dock = open_dock(burst_layer)
-    dock.picture.form.set_choices({"motion": "affine", "upsample": 2.0})
+    dock.picture.form.set_choices({"motion": "affine", "upsample": 1.5})
     dock.picture.copying.python.click()
     text = QApplication.clipboard().text()
     run = run_through(dock)
@@ -228,7 +228,7 @@ def test_copied_python_is_the_exact_call(open_dock, qtbot, run_through, burst_la
     dock.picture.copying.command.click()
     command = QApplication.clipboard().text()
     assert command.splitlines()[-1] == (
-        "fiberburst reconstruct simulated.burst -o image.ome.tif --motion affine --upsample 2.0"
+        "fiberburst reconstruct simulated.burst -o image.ome.tif --motion affine --upsample 1.5"
     )
 
 
@@ -345,7 +345,7 @@ def test_the_list_of_runs_shows_the_newest_first(open_dock, run_through, burst_l
     viewer, dock = open_dock(burst_layer)
     dock.picture.form.set_choices(QUICK)
     for _ in range(3):
-        run_through(dock)
+        run_through(dock, afresh=True)
     table = dock.picture.runs.table
     first, second, third = dock.picture.runs.runs
 

@@ -98,20 +98,28 @@ def test_a_batch_of_videos_has_a_video_and_a_film_of_each(folder, tmp_path):
     assert (made / "thumbnail.png").stat().st_size > 500
 
 
-@pytest.mark.parametrize(("placed", "verdict"), [(40, "doubtful"), (30, "doubtful"), (9, "bad")])
-def test_a_row_is_called_no_better_than_its_mosaic_calls_itself(folder, tmp_path, monkeypatch, placed, verdict):
-    (folder / "broken.avi").unlink()
-    (folder / "clip 9.tif").unlink()
-    whole = tasks.mosaicking
+def test_a_row_is_called_no_better_than_its_mosaic_calls_itself(folder, tmp_path, monkeypatch):
+    """As many frames as are said to have a place, of the three with the same picture."""
+    expected = {"clip a.mkv": (40, "doubtful"), "clip b.mkv": (30, "doubtful"), "clip c.mkv": (9, "bad")}
+    for name in ("broken.avi", "clip 9.tif"):
+        (folder / name).unlink()
+    clip = (folder / "clip 10.mkv").rename(folder / "clip a.mkv")
+    for name in ("clip b.mkv", "clip c.mkv"):
+        (folder / name).write_bytes(clip.read_bytes())
+    whole, first = tasks.mosaicking, []
 
-    def doubted(*given, **named):
-        made = yield from whole(*given, **named)
+    def doubted(source, path, **named):
+        if not first:
+            first.append((yield from whole(source, path, **named)))
+        (made,) = first
+        placed, _ = expected[path.parent.name]
         piece = np.where(np.arange(len(made.track)) < placed, 0, -1)
         return replace(made, track=replace(made.track, piece=piece), quality="doubtful")
 
     monkeypatch.setattr(tasks, "mosaicking", doubted)
     assert main(["batch", str(folder), "--task", "mosaic", "-o", str(tmp_path / "out")]) == 0
-    assert [row["verdict"] for row in table_of(tmp_path / "out")] == [verdict]
+    rows = {row["recording"]: row["verdict"] for row in table_of(tmp_path / "out")}
+    assert rows == {name: verdict for name, (_, verdict) in expected.items()}
 
 
 def test_a_batch_of_bursts_has_an_image_of_each(folder, tmp_path):
@@ -171,7 +179,7 @@ def test_settings_are_checked_before_anything_is_opened(tmp_path):
 def test_videos_of_a_batch_have_what_the_command_line_asks_for(folder, tmp_path, capsys):
     for name in ("broken.avi", "clip 10.mkv"):
         (folder / name).unlink()
-    frames = tifffile.imread(folder / "clip 9.tif")[:12]
+    frames = tifffile.imread(folder / "clip 9.tif")[:8]
     tifffile.imwrite(folder / "clip 11.tif", frames, photometric="minisblack")
     (folder / "clip 9.tif").rename(tmp_path / "whole.tif")
     sized = {"axes": "TYX", "PhysicalSizeX": 0.5, "PhysicalSizeY": 0.5}
@@ -229,7 +237,9 @@ def test_names_are_text_in_the_page(tmp_path):
 def test_a_batch_that_was_killed_before_a_row_goes_on_and_fresh_begins_anew(folder, tmp_path, capsys):
     (folder / "broken.avi").unlink()
     output = tmp_path / "out"
-    words = ["batch", str(folder), "--task", "burst", "-o", str(output)]
+    settings = tmp_path / "batch.toml"
+    settings.write_text("[burst]\nframes = 6\nmotion = 'translation'\niterations = 1\n")
+    words = ["batch", str(folder), "--task", "burst", "-o", str(output), "--settings", str(settings)]
     assert main(words) == 0
     (output / "clip 9.tif" / "row.json").unlink()
     (output / "mine.txt").write_text("stays")
@@ -237,9 +247,7 @@ def test_a_batch_that_was_killed_before_a_row_goes_on_and_fresh_begins_anew(fold
     assert main(words) == 0
     assert (output / "clip 9.tif" / "row.json").exists()
     assert (output / "clip 10.mkv" / "image.ome.tif").stat().st_mtime_ns == kept
-    settings = tmp_path / "batch.toml"
-    settings.write_text("[burst]\nframes = 8\n")
-    words += ["--settings", str(settings)]
+    settings.write_text("[burst]\nframes = 5\nmotion = 'translation'\niterations = 1\n")
     capsys.readouterr()
     assert main(words) != 0
     assert "--fresh" in capsys.readouterr().err

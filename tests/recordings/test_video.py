@@ -145,7 +145,7 @@ def test_looking_for_changes_costs_nothing_where_there_are_none(still, of_still,
 def test_a_run_that_was_cut_short_comes_to_the_same_bits(still, located, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "STRETCH", 16)
     monkeypatch.setattr(stretches, "STRETCH", 16)
-    whole = make_video(still.source, tmp_path / "a.ome.zarr", window=9)
+    whole = make_video(still.source, tmp_path / "a.ome.zarr", window=5)
     work = stretches.solve_unit
     done = []
 
@@ -157,10 +157,10 @@ def test_a_run_that_was_cut_short_comes_to_the_same_bits(still, located, tmp_pat
 
     monkeypatch.setattr(pipeline, "solve_unit", fails_at_last)
     with pytest.raises(KeyboardInterrupt):
-        make_video(still.source, tmp_path / "b.ome.zarr", window=9)
+        make_video(still.source, tmp_path / "b.ome.zarr", window=5)
     again = []
     monkeypatch.setattr(pipeline, "solve_unit", lambda *given: again.append(given) or work(*given))
-    part = make_video(still.source, tmp_path / "b.ome.zarr", window=9)
+    part = make_video(still.source, tmp_path / "b.ome.zarr", window=5)
     assert len(again) == 1
     np.testing.assert_array_equal(pixels_of(part), pixels_of(whole))
     np.testing.assert_array_equal(*(zarr.open_array(one.traces / "cores")[:] for one in (part, whole)))

@@ -3,7 +3,7 @@
 import json
 import struct
 from dataclasses import fields, is_dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -55,7 +55,9 @@ CASES = {
     "published, no encoding": lambda fit: fit(small(), encoding="none"),
     "network": lambda fit: reconstruct(small(channels=3), device="cpu", encoding="fourier", features=16, **NETWORK),
     "network, still": lambda fit: reconstruct(small(), device="cpu", encoding="hash", motion="none", **NETWORK),
-    "network, flow": lambda fit: reconstruct(small(), device="cpu", encoding="siren", motion="flow", **NETWORK),
+    "network, flow": lambda fit: reconstruct(
+        small(), device="cpu", encoding="siren", motion="flow", motion_width=16, motion_layers=1, **NETWORK
+    ),
 }
 
 
@@ -70,19 +72,25 @@ def _flat():
     return simulate("cat", shape=(43, 51), frames=1, pitch=5.0, physics="core", channels=1).transmission
 
 
+@pytest.fixture(scope="module")
+def made(fit):
+    """Return a function that gives the result of a case, which is made once."""
+    return cache(lambda name: CASES[name](fit))
+
+
 @pytest.fixture(scope="module", params=CASES)
-def result(request, fit):
-    return CASES[request.param](fit)
+def result(request, made):
+    return made(request.param)
 
 
 @pytest.fixture(scope="module")
-def grey():
-    return reconstruct(small(), device="cpu")
+def grey(made):
+    return made("grey")
 
 
 @pytest.fixture(scope="module")
-def bent(fit):
-    return CASES["bent"](fit)
+def bent(made):
+    return made("bent")
 
 
 @pytest.fixture
@@ -129,15 +137,15 @@ def test_it_can_be_saved_again(result, tmp_path):
     assert Model.load(first).digest() == Model.load(second).digest()
 
 
-def test_the_cases_have_what_they_are_to_test(fit, bent, grey):
+def test_the_cases_have_what_they_are_to_test(made, bent, grey):
     assert bent.bends
     assert np.nanmax(np.abs(bent.displacement(3))) > 0.1
     assert not [item.name for item in fields(Diagnostics) if getattr(grey, item.name) is None]
-    assert np.isnan(CASES["left out"](fit).image).any()
-    assert CASES["rgb"](fit).image.shape[2] == 3
-    assert CASES["stopped"](fit).ending == "stopped"
-    assert CASES["no first frame"](fit).reference > 0
-    assert CASES["published, flow"](fit).bends
+    assert np.isnan(made("left out").image).any()
+    assert made("rgb").image.shape[2] == 3
+    assert made("stopped").ending == "stopped"
+    assert made("no first frame").reference > 0
+    assert made("published, flow").bends
 
 
 def test_networks_go_on_from_a_model(fit, tiny_burst, tmp_path):

@@ -1,5 +1,7 @@
 """Frames that moved while they were exposed are seen to, and the scene is solved along the way that they went."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import skimage.data
@@ -28,21 +30,32 @@ def found(burst, monkeypatch):
     return reconstruct(burst), kept[0].smear
 
 
+@pytest.fixture(scope="module")
+def smeared(recorded):
+    """Return a function that gives a burst of 14 frames with so much smear, its reconstruction and what was found."""
+
+    @cache
+    def made(smear):
+        simulated = recorded(frames=14, seed=4, smear=smear)
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            return simulated, *found(simulated.burst, monkeypatch)
+
+    return made
+
+
 @pytest.mark.parametrize("smear", [0.7, 1.0])
-def test_a_smear_is_found_and_its_blur_taken_out(smear, recorded, quality, monkeypatch):
-    simulated = recorded(frames=14, seed=4, smear=smear)
-    result, told = found(simulated.burst, monkeypatch)
+def test_a_smear_is_found_and_its_blur_taken_out(smear, smeared, quality, monkeypatch):
+    simulated, result, told = smeared(smear)
     # The simulated camera looks at moments up to both ends of the exposure, which spread as those of a longer one do.
     assert told.part == pytest.approx(1.18 * smear, abs=0.2)
     assert any("while they were exposed" in note for note in result.notes)
     monkeypatch.setattr("napari_fiberburst.scene.solve.find_smear", lambda *_: None)
-    assert quality(result, simulated) > quality(reconstruct(simulated.burst), simulated) + 0.3
+    assert quality(result, simulated) > quality(reconstruct(simulated.burst), simulated) + 1.0
 
 
-@pytest.mark.parametrize(("smear", "gain"), [(0.6, 0.03), (1.0, 0.15)])
-def test_motion_and_gains_are_found_along_the_ways(smear, gain, recorded, quality, monkeypatch):
-    simulated = recorded(frames=14, seed=5, smear=smear)
-    result = reconstruct(simulated.burst)
+@pytest.mark.parametrize(("smear", "gain"), [(0.7, 0.1), (1.0, 0.4)])
+def test_motion_and_gains_are_found_along_the_ways(smear, gain, smeared, quality, monkeypatch):
+    simulated, result, _ = smeared(smear)
     monkeypatch.setattr("napari_fiberburst.pipeline.scenes.refine_along", lambda *given: given[1])
     before = reconstruct(simulated.burst)
     shape = simulated.truth.shape[1:3]
@@ -52,15 +65,12 @@ def test_motion_and_gains_are_found_along_the_ways(smear, gain, recorded, qualit
     np.testing.assert_allclose(result.homographies[result.reference], np.eye(3), atol=1e-9)
 
 
-def test_smeared_frames_are_solved_again_to_the_same_bits(recorded):
-    simulated = recorded(frames=14, seed=5, smear=0.8)
-    result = reconstruct(simulated.burst)
+def test_smeared_frames_are_solved_again_to_the_same_bits(smeared):
+    simulated, result, _ = smeared(0.7)
     again = result.solve_again(smoothness=0.02, leave_out=(4,))
     anew = reconstruct(simulated.burst, smoothness=0.02, leave_out=(4,))
     np.testing.assert_array_equal(again.image, anew.image)
-    np.testing.assert_array_equal(
-        result.solve_again(smoothness=0.02).image, reconstruct(simulated.burst, smoothness=0.02).image
-    )
+    np.testing.assert_array_equal(result.solve_again().image, result.image)
 
 
 def test_frames_that_rest_while_they_are_exposed_are_left_alone(recorded, monkeypatch):
