@@ -13,6 +13,8 @@ from napari_fiberburst.simulation import Camera, Faults, Scene, SimulatedBurst, 
 # Behind every clean burst, so many with a fault; and how often with two.
 FAULTY_EACH, _TWO_FAULTS = 3, 0.2
 _SCENES = ("histology", "tissue", "cat", "usaf", "retina")
+# How often the object is dark but for some cells.
+_DARK = 0.1
 _SHAPES = ((157, 171), (224, 224), (301, 253), (192, 240))
 # How often frames are wide, or many: of objects that have so much to see without reflections.
 _LARGE, _LARGE_SCENES = 0.15, ("tissue", "retina")
@@ -84,7 +86,7 @@ class Drawn:
 
 def unseen(seed: int) -> tuple[Drawn, Iterator[tuple[str, Mapping[str, Any]]]]:
     """Draw a burst, and names and settings of the faults to see it with."""
-    rng, rng_large = np.random.default_rng(seed), np.random.default_rng((seed, 1))
+    rng, rng_large, rng_dark = (np.random.default_rng(part) for part in (seed, (seed, 1), (seed, 2)))
     drawn = Drawn(
         scene=str(rng.choice(_SCENES)),
         place=(rng.uniform(), rng.uniform()),
@@ -102,6 +104,8 @@ def unseen(seed: int) -> tuple[Drawn, Iterator[tuple[str, Mapping[str, Any]]]]:
             drawn = replace(drawn, shape=_LARGE_SHAPES[rng_large.integers(len(_LARGE_SHAPES))], frames=12)
         else:
             drawn = replace(drawn, frames=int(rng_large.choice(_MANY_FRAMES)))
+    if rng_dark.uniform() < _DARK:
+        drawn = replace(drawn, scene="cells")
     return drawn, (_faults(rng, drawn.frames) for _ in range(FAULTY_EACH))
 
 

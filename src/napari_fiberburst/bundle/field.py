@@ -35,6 +35,9 @@ _THIN, _LEAST_PART = 3, 0.1
 # A field stands still: in the median frame light reaches over this part of it at least. An object on a dark ground
 # takes its outline along.
 _LEAST_REACH = 0.97
+# Light fills a field, which is convex, to this part of it at least. Cells on a dark ground do not, and those that stand
+# apart would be taken for marks.
+_LEAST_FILLED = 0.85
 # So many frames are asked whether it does.
 _ASKED = 8
 # A field takes at least this part of the frame: what is smaller is a spot of light in it.
@@ -84,6 +87,8 @@ def find_field(frames: Tensor, pitch: float | None = None) -> Tensor:
     if not parts.any():
         return everywhere
     hull = _convex_hull(parts)
+    if lit[hull].mean() < _LEAST_FILLED:
+        return everywhere
     if _share(~hull & ~lit) < _LEAST_SURROUNDINGS or _share(hull) < _LEAST_FIELD:
         return everywhere
     if not _stands_still(frames, level, hull, width):

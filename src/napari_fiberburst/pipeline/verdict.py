@@ -38,8 +38,10 @@ _SINGLE_CORES, _MISFIT_OF_FEW = 6.0, 6.0
 # dark on the other.
 _STRUCTURE, _BLURRED = 0.12, -0.05
 # Power of what stands still in the residuals, 1 for noise. What one pattern adds to it grows with the frames that are
-# averaged, so beyond so many of them what is too weak to matter would be seen as well.
-_STILL_PATTERN, _STILL_FRAMES = 2.2, 20
+# averaged, so beyond so many of them what is too weak to matter would be seen as well. So it would where most of the
+# object is dark, because there is hardly any noise: samples left out are then missed by less than the last number, in
+# parts as above.
+_STILL_PATTERN, _STILL_FRAMES, _HARDLY_ANY_ERROR = 2.2, 20, 0.05
 # In pitches, root mean square: an object that travels less has not told its cores' gains from its light.
 _SHORT_TRAVEL = 0.4
 # In pitches, root mean square: frames that moved farther while they were exposed show no more of what lies along it.
@@ -110,7 +112,8 @@ def judge(fit: GoodnessOfFit, registration: Registration, pitch: float, *, gains
             "the first half of the frames shows another image than the second half: the object, or how the frames look "
             "at it, has changed"
         )
-    if fit.still > 1 + (_STILL_PATTERN - 1) * max(1.0, used / _STILL_FRAMES):
+    is_exact = fit.error <= _HARDLY_ANY_ERROR * gaps
+    if fit.still > 1 + (_STILL_PATTERN - 1) * max(1.0, used / _STILL_FRAMES) and not is_exact:
         reasons.append(
             "a pattern that stands still in all frames is not explained: a bundle that was not found, light of the "
             "bundle itself, or an object that was held for one"

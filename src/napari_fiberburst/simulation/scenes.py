@@ -82,7 +82,7 @@ def make_scene(name: str, shape: tuple[int, int], rng: Generator, reach: Reach |
     Parameters
     ----------
     name : str
-        One of `SCENES`: histology, retina, cat (photographs), usaf, tissue (drawn).
+        One of `SCENES`: histology, retina, cat (photographs), usaf, tissue, cells (drawn).
     shape : (int, int)
         Of a frame. Photographs keep their own resolution: a larger frame sees more of them, then reflections.
     rng : numpy.random.Generator
@@ -193,6 +193,31 @@ def fibrous_tissue(
     return Scene((0.04 + 0.92 * (1 - np.exp(-1.6 * glow))).astype(np.float32), origin)
 
 
+def fluorescent_cells(
+    shape: tuple[int, int], rng: Generator, reach: Reach | None = None, *, cells: float = 0.0007
+) -> Scene:
+    """Draw bright cells on a dark ground, `cells` to a pixel of area: ellipses of three stains, some of which touch."""
+    image, origin = _blank(shape, 0.0, reach)
+    height, width = image.shape[:2]
+    light = np.zeros((height, width, 3), np.float32)
+    stains = np.array([[0.25, 1.0, 0.35], [1.0, 0.35, 0.2], [0.2, 0.45, 1.0]], np.float32)
+    for _ in range(max(1, round(cells * height * width))):
+        x, y, turn = rng.uniform(0, width), rng.uniform(0, height), rng.uniform(0, math.pi)
+        long, short = rng.uniform(8, 18), rng.uniform(6, 12)
+        top, left = max(0, math.floor(y - 25)), max(0, math.floor(x - 25))
+        part = light[top : math.ceil(y + 25), left : math.ceil(x + 25)]
+        rows, columns = np.indices(part.shape[:2])
+        down, along = rows + top - y, columns + left - x
+        first, second = (
+            along * math.cos(turn) + down * math.sin(turn),
+            down * math.cos(turn) - along * math.sin(turn),
+        )
+        inside = 1 / (1 + np.exp(8 * (np.hypot(first / long, second / short) - 1)))
+        stain = rng.uniform(0.35, 1.0) * stains[rng.integers(3)]
+        np.maximum(part, inside[..., None] * stain, out=part)
+    return Scene((0.002 + 0.95 * light).astype(np.float32), origin)
+
+
 def _photograph(load: Callable[[], NDArray[np.uint8]]) -> "SceneMaker":
     def scene(shape: tuple[int, int], rng: Generator, reach: Reach | None = None) -> Scene:
         image = load()
@@ -241,5 +266,6 @@ SCENES: Mapping[str, SceneMaker] = {
     "retina": _photograph(skimage.data.retina),
     "usaf": usaf_chart,
     "tissue": fibrous_tissue,
+    "cells": fluorescent_cells,
     "cat": _photograph(skimage.data.cat),
 }

@@ -167,7 +167,7 @@ def simulate(
     Parameters
     ----------
     scene : str or Scene
-        "histology", "retina", "cat", "usaf", "tissue", or a scene of your own.
+        "histology", "retina", "cat", "usaf", "tissue", "cells", or a scene of your own.
     shape : (int, int), optional
         Height and width of a frame. Default 256 x 256, or all of `flat`; a smaller shape is its middle.
     frames : int
