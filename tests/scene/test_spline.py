@@ -102,3 +102,21 @@ def test_a_solution_is_the_exact_one_to_a_part_of_its_finest_detail():
     solution = normal.solve(smoothness, iterations=200)[0]
     left = (solution - exact.reshape(SHAPE))[INSIDE]
     assert float(left.std()) < 0.05 * float(exact.reshape(SHAPE)[INSIDE].std())
+
+
+def test_a_scene_is_black_in_the_dark_and_as_it_was_where_samples_have_looked():
+    points = everywhere(3)
+    points = points[points[:, 0] < 30]
+    grid = Grid(0.0, 0.0, 1.0, SHAPE)
+    normal = NormalEquations.empty(grid, 1.3, 1, torch.device("cpu"))
+    normal = normal.with_samples(points, (points[:, :1] / 30 - 0.2).clamp_min(0), torch.ones(len(points)))
+    dark = grid.nodes()[..., 0] > 32
+    light, black = (equations.solve(0.1, iterations=300)[0] for equations in (normal, normal.darkened(dark, 2.0)))
+    assert float(light[:, 50].min()) > 0.2
+    assert float(black[:, 50].abs().max()) < 0.05
+    torch.testing.assert_close(black[:, :24], light[:, :24], atol=0.01, rtol=0)
+
+
+def test_a_scene_without_samples_is_black_in_the_dark():
+    normal = NormalEquations.empty(Grid(0.0, 0.0, 1.0, SHAPE), 1.3, 1, torch.device("cpu"))
+    assert not normal.darkened(torch.ones(SHAPE, dtype=torch.bool), 2.0).solve(0.1).any()

@@ -242,7 +242,7 @@ def _explain(error: Exception) -> str:
 def load_solver() -> dict[str, str]:
     """Load PyTorch, which takes seconds, ahead of the first run; return the devices that are not here, and why.
 
-    So is what napari makes shapes with, pandas among it, because the first outlines would wait for it half a second.
+    What napari makes shapes with is loaded too, pandas among it, because the first outlines would wait for it.
     """
     from napari.layers import Shapes
 

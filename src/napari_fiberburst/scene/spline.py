@@ -142,7 +142,8 @@ class NormalEquations:
         reach : float
             Pixels, over what distance samples are near.
         """
-        near = blur(self.density(), reach / self.grid.spacing) / (_LEAST_DENSITY * self._usual_density())
+        few = max(_LEAST_DENSITY * self._usual_density(), 1e-12)
+        near = blur(self.density(), reach / self.grid.spacing) / few
         bands = self.bands.clone()
         bands[0] += _DARK_WEIGHT * dark.to(bands.device) * (1 - near).clamp_min(0)
         return replace(self, bands=bands)
