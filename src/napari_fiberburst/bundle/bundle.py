@@ -133,6 +133,10 @@ class Bundle(Stored):
             return 0.0
         return MEASURED_GAINS if self.gains_known else GUESSED_GAINS
 
+    def black_in(self, acquisition: Acquisition) -> float:
+        """Return the black level in the intensities of a burst, full scale 1."""
+        return (self.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
+
     @property
     def brightness(self) -> NDArray[np.float64]:
         """How much light each core passes, as a part of a bright core's, (N,)."""

@@ -106,7 +106,7 @@ def dark_places(frames: Tensor, bundle: Bundle, acquisition: Acquisition) -> Ten
     beyond = torch.from_numpy(~bundle.outline).to(frames.device)
     if not bool(beyond.any()):
         return None
-    black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
+    black = bundle.black_in(acquisition)
     light = local_mean((only_exposed(frames).mean(dim=0) - black).clamp_min(0), bundle.pitch)
     lit = light[~beyond]
     if not len(lit):

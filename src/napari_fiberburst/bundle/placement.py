@@ -116,7 +116,7 @@ def find_bundle(bundle: Bundle, grey: Tensor, acquisition: Acquisition) -> Place
     if not bundle.is_resolved or len(bundle.centres) < _LEAST_CORES:
         return Placement(bundle)
     mean = only_exposed(grey).mean(dim=0)
-    black = (bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level)
+    black = bundle.black_in(acquisition)
     flat, lit = (part.cpu() for part in _flattened((mean - black).clamp_min(0), bundle.pitch))
     observed = Observed(image=flat.numpy(), lit=lit.numpy(), cores=find_cores(flat, bundle.pitch, lit))
     if len(observed.cores) < _LEAST_CORES:

@@ -161,7 +161,7 @@ class BundleTensors:
             centres=torch.from_numpy(bundle.centres).float().to(device),
             gains=torch.from_numpy(bundle.gains).to(device),
             offsets=torch.from_numpy(bundle.offsets).to(device) / span,
-            black=(bundle.black - acquisition.black_level) / span,
+            black=bundle.black_in(acquisition),
         )
 
     def per_channel(self, values: Tensor, channels: int) -> Tensor:

@@ -27,7 +27,7 @@ def image_of(
         fill=fill,
         homographies=registration.reference_from_frame,
         motion=None if registration.displacement is None else registration.motion.cpu(),
-        black=(bundle.black - acquisition.black_level) / (acquisition.white_level - acquisition.black_level),
+        black=bundle.black_in(acquisition),
     )
 
 

@@ -62,12 +62,13 @@ class Scenes:
         fitted = self.without_left_out(fitted)
         fitted = replace(fitted, canvas=self.canvas(fitted.registration, samples))
         grid = self.grid(fitted)
+        dark = _dark(fitted, grid)
         smoothness = self._method.smoothness
         if draft is None:
-            steps = drafting(samples, fitted.registration, grid, is_asked=smoothness is None, dark=_dark(fitted, grid))
+            steps = drafting(samples, fitted.registration, grid, is_asked=smoothness is None, dark=dark)
             fitted, draft = yield from self._drawn(fitted, steps)
             if draft.smear is not None:
-                fitted, draft = yield from self._drawn_again(fitted, draft, grid)
+                fitted, draft = yield from self._drawn_again(fitted, draft, grid, dark)
         final = finishing(
             draft,
             samples,
@@ -76,12 +77,14 @@ class Scenes:
             smoothness=smoothness,
             held_out=self._method.held_out,
             seed=self._seed,
-            dark=_dark(fitted, grid),
+            dark=dark,
         )
         fitted, scene = yield from self._drawn(fitted, final)
         return replace(self.with_scene(fitted, scene), draft=draft)
 
-    def _drawn_again(self, fitted: Fitted, draft: Draft, grid: Grid) -> Generator[Fitted, None, tuple[Fitted, Draft]]:
+    def _drawn_again(
+        self, fitted: Fitted, draft: Draft, grid: Grid, dark: Tensor | None
+    ) -> Generator[Fitted, None, tuple[Fitted, Draft]]:
         """Find the motion of smeared frames again, and what can be learned of their samples where they then lie."""
         samples, before = fitted.samples, fitted.registration
         assert samples is not None
@@ -92,7 +95,6 @@ class Scenes:
         if registration is before:
             return fitted, draft
         yield fitted
-        dark = _dark(fitted, grid)
         steps = drafting(samples, registration, grid, is_asked=self._method.smoothness is None, dark=dark)
         return (yield from self._drawn(replace(fitted, registration=registration), steps))
 
